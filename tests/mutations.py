@@ -123,7 +123,7 @@ MUTATIONS = (
     ),
     Mutation(
         "gains never drift", "estimation/tracker.py",
-        "gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY_WINDOWS, 1.0)",
+        "gains = problem.gain_std**2 * min((elapsed + 1.0) / self.options.gain_memory, 1.0)",
         "gains = 0.0 * problem.gain_std",
         ("tests/estimation/test_tracker_drift.py::test_gains_are_known_for_minutes_and_not_for_ever",),
     ),

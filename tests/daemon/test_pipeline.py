@@ -170,7 +170,8 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-MORE = {"solver", "search_ended", "window", "log", "reason", "state", "soil_class", "capability", "gaps", "warning"}
+OF_DECISION = {"state", "reason", "capability", "warning"}
+MORE = OF_DECISION | {"solver", "search_ended", "window", "log", "soil_class", "soil_change", "gaps"}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {
     "contradicted",

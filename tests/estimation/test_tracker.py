@@ -124,7 +124,7 @@ def test_a_soil_found_afresh_is_another_one_from_where_its_data_begin():
         assert tracker.estimate(empty, end + first).fit is None
     assert [r.state for r in results] == [TrackerState.NEW_SOIL] + [TrackerState.STEADY] * (len(results) - 1)
     assert all(abs(off(r, "wet_clay")) < 3.5 for r in results)
-    assert tracker._transition.end == pytest.approx(30.0, abs=0.2)
+    assert tracker.state.transition.end == pytest.approx(30.0, abs=0.2)
 
 
 def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():

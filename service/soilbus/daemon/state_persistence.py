@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, read, stored_gaussian, write_whole
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import GAIN_CORRELATION_TIME
+from soilbus.estimation.tracker import TrackerOptions
 from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
@@ -63,12 +63,13 @@ class StatePersistence:
 
     @property
     def stored_prior(self) -> StoredPrior | None:
-        """Posterior of the last run; GAIN_CORRELATION_TIME old where the clock was set back since, None without one."""
+        """Posterior of the last run; a gain correlation time old where the clock was set back, None without one."""
         if self._previous is None or self._previous.gaussian is None:
             return None
         elapsed = self._wall() - self._previous.gaussian.at
         return StoredPrior(
-            gaussian_of(self._previous.gaussian, self._owner), elapsed if elapsed >= 0.0 else GAIN_CORRELATION_TIME
+            gaussian_of(self._previous.gaussian, self._owner),
+            elapsed if elapsed >= 0.0 else TrackerOptions().gain_correlation_time,
         )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:

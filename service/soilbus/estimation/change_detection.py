@@ -6,12 +6,24 @@
 A generalised log likelihood ratio over the instant k of change (GLR; Basseville & Nikiforov, Detection of Abrupt
 Changes, 1993, ch. 2): residuals larger than noise against noise alone, after the part that the predicted
 soil explains within its covariance (step d) is removed.  The likeliest k is where a new soil may begin.
+
+The threshold h follows from a false-alarm probability: where the m last instants, of r residuals each, are noise,
+
+    P(max over k of GLR(k) > h) = P(GLR(1) > h) + b^2 phi(b) / 2  sum_{j = 2..m} exp(-0.583 b / sqrt(j)) / (j u_j)
+    P(GLR(1) > h) = Phi(-b) + phi(b) (1 / u_1 - 1 / b)
+    b = sqrt(2 h),    u_j = (q_j - 1) sqrt(r j / 2),    q_j - 1 - log q_j = 2 h / (r j)
+
+The sum is the rate at which a normalised random walk, looked at after each of j steps, first passes b (Siegmund,
+Sequential Analysis, 1985, ch. 4 and 10); 1 / u_j is the tail of chi-square there (Lugannani & Rice 1980, Adv. Appl.
+Prob. 12:475).
 `Transition` is the time between two soils, when wheels of the two axles stand on different ones.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,14 +37,20 @@ from soilbus.estimation.window import Window
 
 
 class ChangeStatistic(NamedTuple):
-    """Index of the first instant that may be on another soil, and its log likelihood ratio."""
+    """Index of the first instant that may be on another soil, its log likelihood ratio, and the threshold of that."""
 
     instant: int
     ratio: float
+    threshold: float
+
+    @property
+    def is_alarm(self) -> bool:
+        """Whether noise is not the reason."""
+        return self.ratio > self.threshold
 
 
 def change_statistic(
-    objective: Objective, joint_prior: Gaussian, iterate: Iterate, at: Linearisation, first: int, threshold: float
+    objective: Objective, joint_prior: Gaussian, iterate: Iterate, at: Linearisation, first: int, false_alarms: float
 ) -> ChangeStatistic:
     """The likeliest beginning of another soil among the instants from `first` on.
 
@@ -48,35 +66,36 @@ def change_statistic(
         The residuals there.
     first : int
         Index of the first instant that may be on another soil.
-    threshold : float
-        Log likelihood ratio up to which an upper bound suffices, to save time.
+    false_alarms : float
+        Probability that the noise of one window passes the threshold.
 
     Returns
     -------
     ChangeStatistic
+        The ratio is an upper bound where that does not pass the threshold, to save time.
     """
     n, m = at.by_latents.shape[:2]
     if first >= n:
-        return ChangeStatistic(max(n - 1, 0), 0.0)
+        return ChangeStatistic(max(n - 1, 0), 0.0, math.inf)
     rows, weighed = (a.reshape(n, m, -1)[first:] for a in (at.rows, at.weighed))
     misfit = np.einsum("im,im->i", rows[:, :, RESIDUAL], weighed[:, :, RESIDUAL])
     count = np.count_nonzero(rows.any(axis=2), axis=1).astype(float)
-    ratio = _log_likelihood_ratio(misfit, count)
+    ratio = log_likelihood_ratio(misfit, count)
+    threshold = alarm_threshold(false_alarms, n - first, max(round(float(count.mean())), 1))
     if ratio.max() <= threshold:
-        return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
+        return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()), threshold)
     with_prior = objective.with_joint_prior(joint_prior)
     directions = with_prior.directions(iterate)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, RESIDUAL]) @ directions
     information = directions.T @ np.einsum("imk,iml->ikl", rows, weighed) @ directions
     prior_information = with_prior.prior_at(iterate).information
-    begin = int(np.argmax(_log_likelihood_ratio(misfit - _explained(gradient, information + prior_information), count)))
+    begin = int(np.argmax(log_likelihood_ratio(misfit - _explained(gradient, information + prior_information), count)))
     # One common step for all instants from there on: the predicted soil itself must not pass for another.
     unexplained = misfit[begin:].sum() - _explained(
         gradient[begin:].sum(0), information[begin:].sum(0) + prior_information
     )
-    return ChangeStatistic(
-        first + begin, float(_log_likelihood_ratio(unexplained[None], count[begin:].sum(keepdims=True))[0])
-    )
+    ratio = log_likelihood_ratio(unexplained[None], count[begin:].sum(keepdims=True))
+    return ChangeStatistic(first + begin, float(ratio[0]), threshold)
 
 
 def _explained(gradient: Array, information: Array) -> Array:
@@ -85,12 +104,54 @@ def _explained(gradient: Array, information: Array) -> Array:
     return np.asarray((gradient * step).sum(-1))
 
 
-def _log_likelihood_ratio(misfit: Array, count: Array) -> Array:
+def log_likelihood_ratio(misfit: Array, count: Array) -> Array:
     """GLR (N,) from each instant on, by the sum of squares and the number of residuals of each instant (N,)."""
     misfit, count = (np.cumsum(a[::-1])[::-1] for a in (misfit, count))
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.maximum(misfit / count, 1.0)
         return np.where(count > 0.0, 0.5 * count * (excess - 1.0 - np.log(excess)), 0.0)
+
+
+@lru_cache(maxsize=256)
+def alarm_threshold(probability: float, instants: int, residuals: int) -> float:
+    """The threshold that the largest GLR of noise passes with a given probability.
+
+    Parameters
+    ----------
+    probability : float
+        Of a false alarm, at most 0.1: the formula is of the tail.
+    instants, residuals : int
+        Instants at which a change may begin, and residuals of each.
+
+    Returns
+    -------
+    float
+        Log likelihood ratio, between 0.5 and 700.
+
+    Examples
+    --------
+    >>> round(alarm_threshold(1e-5, instants=31, residuals=9), 1)
+    11.3
+    """
+    low, high = 0.5, 700.0
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _false_alarms(middle, instants, residuals) > probability else (low, middle)
+    return high
+
+
+def _false_alarms(threshold: float, instants: int, residuals: int) -> float:
+    """Probability that the largest GLR of noise passes a threshold."""
+    b, j = math.sqrt(2.0 * threshold), np.arange(1.0, instants + 1.0)
+    count = residuals * j
+    q = 1.0 + b * np.sqrt(2.0 / count) + 2.0 * threshold / count
+    for _ in range(8):  # Newton steps
+        q -= (q - 1.0 - np.log(q) - 2.0 * threshold / count) / (1.0 - 1.0 / q)
+    u = (q - 1.0) * np.sqrt(0.5 * count)
+    density = math.exp(-threshold) / math.sqrt(2.0 * math.pi)
+    of_last = 0.5 * math.erfc(b / math.sqrt(2.0)) + density * (1.0 / u[0] - 1.0 / b)
+    others = 0.5 * b**2 * density * np.exp(-0.583 * b / np.sqrt(j)) / (j * u)
+    return float(of_last + others[1:].sum())
 
 
 class Transition(NamedTuple):

@@ -8,14 +8,14 @@
     so that no sample counts twice.  Of k_c, n, phi and c the likelihood factor is carried, apart from their priors,
     since likelihoods add up in k_c, n, tan phi and c and not in their logarithms (`Gaussian.likelihood_factor`).
 
-A window starts from the optimum of the last one (warm start).  The change detector compares the newest data
-with this prediction by a generalised log likelihood ratio (GLR, see change_detection).  The states:
+A window is fitted as one soil, from the optimum of the last one (warm start).  Where the newest data disagree with
+that soil (change_detection) or it does not describe the window, another soil is searched for (`Tracker._explained`),
+and `next_state` says which soil the estimate is of:
 
     STEADY       one soil; the recursion above
-    SUSPECT      the GLR exceeds its limit: a change point; two soils, before and after it, do not yet explain the
-                 window, or too few data are of the second
-    TRANSITION   two soils have much more evidence than one: the second has the wide prior of a new soil and the
-                 gains of the recursion; data between the soils are left out, for borders of growing length
+    SUSPECT      a change point, and too few data after it for a second soil
+    TRANSITION   two soils have much more evidence than one, but the border may not be over: the second has the wide
+                 prior of a new soil and the gains of the recursion; data between the soils are left out
     NEW_SOIL     the border is over and less than a window old; once it is out of the window, STEADY
 
 A fit that exceeds its chi-square limit is a mismatch and never a prior.  Searches from many starts are
@@ -25,7 +25,7 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
+from soilbus.estimation.change_detection import ChangeStatistic, Transition, change_statistic, without_transition
 from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
@@ -59,74 +59,121 @@ from soilbus.terra.wheel import Soil, WheelModel
 
 __all__ = [
     "ChangePoint",
+    "Reason",
     "SearchBudget",
     "Settings",
+    "Shown",
+    "SoilState",
     "Tracker",
+    "TrackerOptions",
     "TrackerOutput",
     "TrackerState",
     "gain_errors",
     "new_soil_prior",
+    "next_state",
 ]
 
-MIN_ROWS = 60
-"""Residuals that a window needs; no evidence recorded."""
-MIN_RESIDUALS_PER_SOIL = 30
-"""Residuals that each of two soils needs before they are compared; no evidence recorded."""
-MISMATCH_SD = 3.5
-"""Sd of reduced chi-square by which a window may exceed `max_chi2`; no evidence recorded."""
-MISMATCH_SD_AFTER_MISMATCH = 0.0
-"""The same after a mismatch."""
-TRANSITION_SD = 1.5
-"""The same just after a border: its remains in the window bias the soil long before they are a mismatch."""
-SUSPECT_LOG_LIKELIHOOD_RATIO = 12.0
-"""Log likelihood ratio of the change detector above which another soil is fitted; no evidence recorded."""
-MIN_EVIDENCE_GAIN = 20.0
-"""Fall of -2 log evidence by two soils instead of one from which the change is accepted; no evidence recorded."""
-MIN_EXTENSION_GAIN = 25.0
-"""Fall of -2 log posterior, beyond the number of residuals left out, from which these are part of the transition."""
-MAX_SCALE_STATISTIC = 25.0
-"""Score statistic, chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd."""
-LOOK_BACK_WINDOWS = 0.2
-"""Windows before the end of the last fit's data from which on changes are looked for."""
-MIN_WINDOWS_TO_DETECT = 0.3
-"""Windows that a new soil must fill before the next change is looked for."""
-MIN_WINDOWS_TO_LEARN = 0.5
-"""Windows that the data must fill for the posterior to be a later prior: with less it is not Gaussian."""
-CHANGE_POINT_WINDOWS = 2.0
-"""Windows after a change point during which a change may explain a mismatch."""
-UNEXPLAINED_WINDOWS = 0.3
-"""Windows after a change point during which data that no soil explains are not yet a mismatch."""
-DRIFT_SINCE_MIDDLE_WINDOWS = 0.5
-"""Windows of drift between a fit with a constant soil, whose estimate is of the window's middle, and its end."""
-SETTLING_RATIO = 2.0
-"""Time that a new soil must last, over that of its gradual border, until the transition is over; at most
-`MIN_WINDOWS_TO_LEARN`.  No evidence recorded."""
-TRANSITION_WHEELBASES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
-"""Lengths of a transition that are tried, in wheelbases: borders are sharp or gradual."""
-EXTENSION_SHARES = (0.1, 0.25, 0.45, 0.7)
-"""Shares of a new soil's data that are tried as part of its transition."""
-DEFAULT_WHEELBASE = 2.0
-"""Length [m] that stands for the wheelbase of a rig that has none."""
-GAIN_MEMORY_WINDOWS = 60.0
-"""Windows in which the variance of a sensor gain may grow by its whole prior variance."""
-GAIN_CORRELATION_TIME = 86400.0
-"""Time [s] in which the autocorrelation of a gain error falls to 1/e: amplifiers drift, tyres wear."""
 TIME_TOLERANCE = 1e-3
 """Times [s] closer than this are the same."""
 _SOIL = len(PARAMETERS)
 
 
+@dataclass(frozen=True, slots=True)
+class TrackerOptions:
+    """Tuning values of the tracker; times in windows are in units of `Settings.window`.
+
+    Attributes
+    ----------
+    false_alarms_per_hour
+        Windows an hour in which noise alone makes the change detector search for another soil (change_detection).
+    mismatch_sd
+        Sd of reduced chi-square by which a window may exceed `Settings.max_chi2`; 0 after a mismatch.
+        No evidence recorded.
+    settled_sd
+        The same just after a border: its remains in the window bias the soil long before they are a mismatch.
+    min_evidence_gain
+        Fall of -2 log evidence by two soils instead of one from which the change is accepted, and of -2 log posterior,
+        beyond the number of residuals left out, from which these are part of the transition.
+    max_scale_statistic
+        Score statistic, chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd.
+    min_rows_per_soil
+        Residuals that each of two soils needs before they are compared.  No evidence recorded.
+    min_to_detect
+        Windows that a soil must fill before a change from it is looked for, that lie before the end of the last fit's
+        data and are looked at again, and after a change point during which data that no soil explains may be of a
+        border.
+    min_to_learn
+        Windows that the data must fill for the posterior to be a later prior: with less it is not Gaussian.
+    max_unexplained
+        Windows after a change point during which a change may explain a mismatch.
+    settling_ratio
+        Time that a new soil must last, over that of its gradual border, until the transition is over; at most
+        `min_to_learn`.  No evidence recorded.
+    extension_shares
+        Shares of a new soil's data that are tried as part of its transition.
+    transition_lengths
+        Lengths of a transition that are tried, in wheelbases: borders are sharp or gradual.
+    default_wheelbase
+        Length [m] that stands for the wheelbase of a rig that has none.
+    gain_memory
+        Windows in which the variance of a sensor gain may grow by its whole prior variance.
+    gain_correlation_time
+        Time [s] in which the autocorrelation of a gain error falls to 1/e: amplifiers drift, tyres wear.
+    """
+
+    false_alarms_per_hour: float = 1.0
+    mismatch_sd: float = 3.5
+    settled_sd: float = 1.5
+    min_evidence_gain: float = 20.0
+    max_scale_statistic: float = 25.0
+    min_rows_per_soil: int = 30
+    min_to_detect: float = 0.3
+    min_to_learn: float = 0.5
+    max_unexplained: float = 2.0
+    settling_ratio: float = 2.0
+    extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
+    transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
+    default_wheelbase: float = 2.0
+    gain_memory: float = 60.0
+    gain_correlation_time: float = 86400.0
+
+
 class TrackerState(StrEnum):
     """Which soil a window's estimate is of."""
 
-    STEADY = "same"
+    STEADY = "steady"
     """The soil of the windows before."""
-    SUSPECT = "changing"
+    SUSPECT = "suspect"
     """The newest data disagree with this soil, but are too few to estimate another; the estimate is of this soil."""
-    TRANSITION = "settling"
+    TRANSITION = "transition"
     """Another soil; the border may not be over: its data do not agree yet or cover too little time."""
-    NEW_SOIL = "new"
+    NEW_SOIL = "new_soil"
     """Another soil for less than a window; only its own data count."""
+
+
+class Reason(StrEnum):
+    """Why a window has its state."""
+
+    ONE_SOIL = "one_soil"
+    """Its data agree with the soil of the windows before (steady)."""
+    TOO_FEW_DATA = "too_few_data"
+    """It has too few residuals to be fitted (steady)."""
+    UNCONFIRMED = "change_unconfirmed"
+    """The change statistic exceeds its threshold, but two soils are not much likelier than one (steady)."""
+    MISMATCH = "mismatch"
+    """No soil describes it (steady), or its newest part (suspect)."""
+    CHANGE_STATISTIC = "change_statistic"
+    """The change statistic exceeds its threshold (suspect)."""
+    TWO_SOILS = "two_soils_likelier"
+    """Two soils have much more evidence than one (new soil)."""
+    ANOTHER_SOIL = "prior_conflict"
+    """Its data conflict with the present soil's prior and are of another one (new soil)."""
+    SPANS_BORDER = "window_spans_border"
+    """The last border is less than a window ago (new soil)."""
+    UNSETTLED = "unsettled"
+    """The fit of the new soil exceeds its chi-square limit just after a border (transition)."""
+    TOO_SHORT = "new_soil_too_short"
+    """The new soil has lasted too short a time for its gradual border to be over (transition)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +198,8 @@ class Settings:
         How far each of `model_form.FORM` may be from the configured model; () holds the form.
     search_rate, search_burst : float
         Evaluations of the model that searches may take, see `SearchBudget`.
+    hop : float
+        Time [s] from one window to the next.
     """
 
     window: float
@@ -158,10 +207,103 @@ class Settings:
     max_turn: float
     max_chi2: float
     drift: float
-    min_rows: int = MIN_ROWS
+    min_rows: int = 60
     form: tuple[float, ...] = ()
     search_rate: float = 4.0
     search_burst: float = 100.0
+    hop: float = 1.0
+
+
+class ChangePoint(NamedTuple):
+    """Time t [s] from which the data disagree with the present soil, ground speed [m/s] then, and why."""
+
+    t: float
+    speed: float
+    statistic: ChangeStatistic
+
+
+@dataclass(frozen=True, slots=True)
+class SoilState:
+    """Which soil the windows are of.
+
+    Attributes
+    ----------
+    name, reason
+        The state, and why it is so.
+    transition
+        The last one: data before its end are of another soil.
+    change
+        A change point that no other soil explains yet.
+    mismatch
+        Whether the last fit was a mismatch.
+    """
+
+    name: TrackerState = TrackerState.STEADY
+    reason: Reason = Reason.ONE_SOIL
+    transition: Transition | None = None
+    change: ChangePoint | None = None
+    mismatch: bool = False
+
+    def spans_border(self, start: float) -> bool:
+        """Whether a window from `start` [s] on may still have data of another soil."""
+        is_open = self.name is TrackerState.TRANSITION and self.mismatch
+        return self.transition is not None and (is_open or start < self.transition.end)
+
+
+class Shown(NamedTuple):
+    """What a window shows.
+
+    Attributes
+    ----------
+    found
+        Why data before the end of `transition` are of another soil than those after it, or before `change` than those
+        after it; None where they are of the soil of the window before.
+    transition
+        The last transition, found now or before.
+    change
+        The change point, where there is one.
+    mismatch, settled
+        Whether the fit exceeds its limit of chi-square; whether it keeps that just after a border.
+    """
+
+    found: Reason | None
+    transition: Transition | None
+    change: ChangePoint | None
+    mismatch: bool
+    settled: bool
+
+
+def next_state(state: SoilState, shown: Shown, end: float, window: float, options: TrackerOptions) -> SoilState:
+    """State after a window that ended at `end` [s], of length `window` [s].
+
+    Parameters
+    ----------
+    state : SoilState
+        After the window before.
+    shown : Shown
+        What the window shows.
+    end, window : float
+        [s].
+    options : TrackerOptions
+
+    Returns
+    -------
+    SoilState
+    """
+    S, transition, now = TrackerState, shown.transition, replace(state, change=shown.change, mismatch=shown.mismatch)
+    if shown.found in (Reason.CHANGE_STATISTIC, Reason.MISMATCH):
+        return replace(now, name=S.SUSPECT, reason=shown.found)
+    if transition is None or not (shown.found or state.spans_border(end - window)):
+        one = Reason.ONE_SOIL if shown.change is None else Reason.UNCONFIRMED
+        return replace(now, name=S.STEADY, reason=Reason.MISMATCH if shown.mismatch else one)
+    now = replace(now, transition=transition)
+    if not shown.settled:
+        return replace(now, name=S.TRANSITION, reason=Reason.UNSETTLED)
+    length = transition.end - transition.begin
+    is_sharp = length < transition.lag + window / 100.0  # shorter than the vehicle
+    if not is_sharp and end - transition.end < min(options.settling_ratio * length, options.min_to_learn * window):
+        return replace(now, name=S.TRANSITION, reason=Reason.TOO_SHORT)
+    return replace(now, name=S.NEW_SOIL, reason=shown.found or Reason.SPANS_BORDER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +324,10 @@ class TrackerOutput:
         Instants left out.
     search_ended : bool
         Whether the budget of evaluations ended the search for a soil that describes the data.
+    reason : Reason
+        Why the state is so.
+    change : ChangePoint or None
+        The present change point.
     """
 
     fit: Fit | None
@@ -191,13 +337,32 @@ class TrackerOutput:
     standstill: int = 0
     turning: int = 0
     search_ended: bool = False
+    reason: Reason = Reason.ONE_SOIL
+    change: ChangePoint | None = None
 
 
-class ChangePoint(NamedTuple):
-    """Time t [s] from which the data disagree with the present soil, and ground speed [m/s] then."""
+class _Present(NamedTuple):
+    """A window without data before the last transition: what is fitted, with which joint prior, from `since` on [s]."""
 
-    t: float
-    speed: float
+    window: Window
+    problem: ObservationModel
+    joint_prior: Gaussian
+    since: float
+    end: float
+
+
+class _Explanation(NamedTuple):
+    """How a window is explained: objective and fit of its data from `since` on [s]; the warm start, if there was one.
+
+    found: why these data are of another soil, or of the soil before a change point; transition: the one to that soil.
+    """
+
+    objective: Objective
+    fit: Fit | None
+    since: float
+    warm: WarmStart | None = None
+    found: Reason | None = None
+    transition: Transition | None = None
 
 
 class Tracker:
@@ -216,6 +381,7 @@ class Tracker:
         Effects of the model.
     free : Sequence of Free
         Their parameters.
+    options : TrackerOptions
     """
 
     def __init__(
@@ -226,16 +392,23 @@ class Tracker:
         settings: Settings,
         effects: Sequence[Effect] = (),
         free: Sequence[Free] = (),
+        options: TrackerOptions = TrackerOptions(),
     ) -> None:
-        self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
+        self.rig, self.prior, self.model, self.settings, self.options = rig, prior, model, settings, options
         self.effects, self.free = tuple(effects), tuple(free)
+        self._new_soil_prior = new_soil_prior(prior)
         self._last_run: tuple[Gaussian, float] | None = None
         self.reset()
 
     @property
     def soil_prior(self) -> SoilPrior:
         """Prior of the present soil: the configured one, or the wider one of a new soil."""
-        return self._soil_prior
+        return self.prior if self._state.transition is None else self._new_soil_prior
+
+    @property
+    def state(self) -> SoilState:
+        """Which soil the last window was of."""
+        return self._state
 
     @property
     def newest_posterior(self) -> Gaussian | None:
@@ -248,14 +421,10 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget all windows."""
-        self._soil_prior = self.prior
-        self._was_mismatch = False  # of the last window
-        self._in_transition = False  # and it was of a transition
+        self._state = SoilState()
         self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
-        self._change_point: ChangePoint | None = None
-        self._transition: Transition | None = None
         self._posteriors: list[tuple[float, Gaussian]] = []
         self._newest_posterior: Gaussian | None = None
 
@@ -273,55 +442,223 @@ class Tracker:
         -------
         TrackerOutput
         """
-        self._budget.next_window(len(window.t), end - self._good_until <= CHANGE_POINT_WINDOWS * self.settings.window)
+        recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
+        self._budget.next_window(len(window.t), refill=recent)
         return replace(self._estimate(window, end), search_ended=self._budget.ended)
 
     def _estimate(self, window: Window, end: float) -> TrackerOutput:
-        """One step of the recursion: warm start, change detection, states, report."""
-        start = end - self.settings.window
-        transition = self._transition
-        new_soil = transition is not None and (self._in_transition or start < transition.end)
-        window = self._of_present_soil(window)
-        problem = self._problem(window)
-        since = max(transition.end, start) if new_soil and transition else start
-        left_out = problem.standstill, problem.turning
-        if problem.n_rows < self.settings.min_rows:
+        """One step of the recursion: data of the present soil, explanation, next state, report."""
+        present = self._present(window, end)
+        left_out = present.problem.standstill, present.problem.turning
+        if present.problem.n_rows < self.settings.min_rows:
             self._fit = None
-            return TrackerOutput(None, False, TrackerState.STEADY, since, *left_out)
-        self._discard_before(start)
-        joint_prior = self._prior_at(since, problem)
-        if self._change_point is not None and self._change_point.t <= end - CHANGE_POINT_WINDOWS * self.settings.window:
-            self._change_point = None  # a new soil would have been found by now
+            return TrackerOutput(None, False, TrackerState.STEADY, present.since, *left_out, reason=Reason.TOO_FEW_DATA)
+        self._discard_before(end - self.settings.window)
+        one = self._one_soil(present)
+        change = self._change_point(present, one)
+        explanation = self._explained(present, one, change)
+        fit = explanation.fit
+        settled = fit is not None and self._is_settled(fit)
+        shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit), settled)
+        state = next_state(self._state, shown, end, self.settings.window, self.options)
+        tracked = TrackerOutput(
+            self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
+            reason=state.reason, change=state.change,
+        )  # fmt: skip
+        self._store(tracked, state, end, present.problem)
+        return tracked
+
+    def _present(self, window: Window, end: float) -> _Present:
+        """The window's data of the present soil."""
+        start, transition = end - self.settings.window, self._state.transition
+        since = start if transition is None else max(transition.end, start)
+        if transition is not None:
+            window = without_transition(window, transition, self.rig.front)
+            window = window.rows(np.flatnonzero(window.t >= transition.end))
+        problem = self._problem(window)
+        return _Present(window, problem, self._prior_at(since, problem), since, end)
+
+    def _problem(self, window: Window) -> ObservationModel:
+        speed, turn = self.settings.min_speed, self.settings.max_turn
+        problem = ObservationModelWithEffects(window, self.rig, self.model, speed, turn, self.effects, self.free)
+        problem.work = self._budget.work
+        return problem
+
+    def _one_soil(self, present: _Present) -> _Explanation:
+        """The window as one soil, the present one: from the optimum of the last window, else from many starts."""
         last = self._fit
-        two_soils = None
         if last is None or (last.second_mode is not None and self._budget.allows()):
-            objective, fit = self._search_either_soil(window, problem, joint_prior)
-            if self.mismatch(fit) and self._change_point is not None:
-                two_soils = self._fit_two_soils(window, self._change_point, fit, joint_prior, None)
-        else:
-            warm = warm_start(problem, self._soil_prior, last, joint_prior)
-            objective, fit = warm.objective, fit_warm(warm)
-            if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
-                fit = refit_denoised(objective, fit)  # slow convergence in a valley is no sign of a new soil
-            if fit is None or not fit.converged:
-                fit = self._search(problem, self._soil_prior, joint_prior) or fit
-            objective, fit = self._with_path_curvature(window, objective, fit)
-            self._change_point = self._change_point_in(window, warm, last, fit, end - since)
-            if self._change_point is not None:
-                two_soils = self._fit_two_soils(window, self._change_point, fit, joint_prior, last)
-            if two_soils is None and self.mismatch(fit) and self._budget.allows():
-                objective, fit = self._search_either_soil(window, problem, joint_prior)
-        if two_soils is not None:
-            return self._stored(replace(two_soils, standstill=left_out[0], turning=left_out[1]), end, problem)
-        new_soil = new_soil or self._transition is not transition
-        if new_soil and fit is not None and self._is_unsettled(fit):
-            objective, fit = self._extend_transition(window, objective, fit)
-        fit = self._reported(objective, fit)
-        if new_soil and self._transition:
-            since, state = max(self._transition.end, start), self._state_after(self._transition, fit, end)
-        else:
-            state = TrackerState.STEADY
-        return self._stored(TrackerOutput(fit, self.mismatch(fit), state, since, *left_out), end, problem)
+            return self._searched(present)
+        warm = warm_start(present.problem, self.soil_prior, last, present.joint_prior)
+        fit = fit_warm(warm)
+        if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
+            fit = refit_denoised(warm.objective, fit)  # slow convergence in a valley is no sign of a new soil
+        if fit is None or not fit.converged:
+            fit = self._search(present.problem, self.soil_prior, present.joint_prior) or fit
+        return self._on_straight_path(present, warm.objective, fit)._replace(warm=warm)
+
+    def _searched(self, present: _Present) -> _Explanation:
+        """The window as one soil, the present one, from many starts."""
+        fit = self._search(present.problem, self.soil_prior, present.joint_prior)
+        objective = Objective(present.problem, self.soil_prior, present.joint_prior)
+        return self._on_straight_path(present, objective, fit)
+
+    def _on_straight_path(self, present: _Present, objective: Objective, fit: Fit | None) -> _Explanation:
+        """The fit with detected path curvature removed; not just after a border, whose residuals that would hide."""
+        transition = self._state.transition
+        is_near_border = transition is not None and present.end < transition.end + self.settings.window
+        path = None if is_near_border else detected_curvature(objective, fit)
+        if fit is not None and path is not None:
+            straight = self._problem(straightened(present.window, self.rig, path))
+            objective, fit = fit_on_curved_path(objective, fit, path, straight)
+        return _Explanation(objective, fit, present.since, transition=transition)
+
+    def _change_point(self, present: _Present, one: _Explanation) -> ChangePoint | None:
+        """Where the newest data disagree with the present soil; what it was while nothing explains the data since."""
+        options, length, change, last = self.options, self.settings.window, self._state.change, self._fit
+        if change is not None and change.t <= present.end - options.max_unexplained * length:
+            change = None  # a new soil would have been found by now
+        if one.warm is None or last is None or (change is not None and self.mismatch(one.fit)):
+            return change if self.mismatch(one.fit) else None
+        fit, warm = one.fit, one.warm
+        if self._good_until <= present.end - length or present.end - present.since <= options.min_to_detect * length:
+            return None
+        if fit is not None and fit.curved_path and self._is_settled(fit):
+            return None  # path curvature explains the disagreement
+        t = warm.objective.problem.t
+        first = int(np.searchsorted(t, float(last.optimum.t[-1]) - options.min_to_detect * length))
+        centred = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
+        half_window = 0.5  # the last estimate is of its window's middle
+        predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
+        false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
+        found = change_statistic(warm.objective, predicted, warm.iterate, warm.linearisation, first, false_alarms)
+        if not found.is_alarm and fit is not None and fit.chi2 <= self.chi2_limit(fit):
+            return None
+        begin, window = float(t[found.instant]), present.window
+        near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
+        return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed), found)
+
+    def _explained(self, present: _Present, one: _Explanation, change: ChangePoint | None) -> _Explanation:
+        """The window as two soils from the change point on, as another soil, or as one that begins later."""
+        two = None if change is None else self._two_soils(present, one, change)
+        if two is not None:
+            return two
+        if self.mismatch(one.fit) and self._budget.allows():
+            one = self._another_soil(present, one if one.warm is None else self._searched(present))
+        if one.found or self._state.spans_border(present.end - self.settings.window):
+            one = self._after_longer_transition(present, one)
+        return one
+
+    def _two_soils(self, present: _Present, one: _Explanation, change: ChangePoint) -> _Explanation | None:
+        """The window as two soils, the second from the change point on; None where one soil is not much less likely.
+
+        Without a last fit, or with too few data of the first soil, the second soil is fitted alone.  Where too few
+        data are of the second, the window's data before the change point.
+        """
+        window, end = present.window, present.end
+        first = self._problem(window.rows(np.flatnonzero(window.t < change.t - TIME_TOLERANCE)))
+        warm = None
+        if one.warm is not None and self._fit is not None and first.n_rows >= self.options.min_rows_per_soil:
+            warm = warm_start(first, self.soil_prior, self._fit, present.joint_prior)
+        old = None if warm is None else fit_warm(warm)
+        old = None if self.mismatch(old) else old
+        if old is None and not self.mismatch(one.fit):
+            return None
+        joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
+        candidates = self._candidate_transitions(change, float(window.t[0]))
+        new = self._after_transition(window, candidates, self._new_soil_prior, joint_prior)
+        if new is not None and new.transition is not None:
+            separated = without_transition(window, new.transition, self.rig.front)
+            whole = present._replace(window=separated, problem=self._problem(separated))
+            if old is not None and not self._are_likelier(old, new.fit, self._searched(whole).fit):
+                return None
+            return new._replace(found=Reason.TWO_SOILS)
+        if warm is None or old is None or end >= change.t + self.options.min_to_detect * self.settings.window:
+            return None
+        reason = Reason.CHANGE_STATISTIC if change.statistic.is_alarm else Reason.MISMATCH
+        return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
+
+    def _after_transition(
+        self, window: Window, transitions: Iterable[Transition], prior: SoilPrior, joint_prior: Gaussian
+    ) -> _Explanation | None:
+        """The data after the first of some transitions, of growing length, that leaves one soil.
+
+        None where none does, or too few data are left.
+        """
+        for transition in transitions:
+            separated = without_transition(window, transition, self.rig.front)
+            problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
+            arrived = transition.end + transition.lag if self._state.mismatch else transition.end
+            if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
+                return None  # after a mismatch both axles and the draft must agree on the new soil
+            fit = self._search(problem, prior, joint_prior)
+            if fit is not None and not self.mismatch(fit):
+                return _Explanation(Objective(problem, prior, joint_prior), fit, transition.end, None, None, transition)
+        return None
+
+    def _candidate_transitions(self, change: ChangePoint, start: float) -> list[Transition]:
+        """Transitions of growing length from the change point on; of those over before `start` [s] only the last."""
+        chassis = self.rig.chassis
+        lag = (self.options.default_wheelbase if chassis is None else chassis.wheelbase) / change.speed
+        ends = [change.t + length * lag for length in self.options.transition_lengths]
+        n_over = sum(end <= start for end in ends)
+        return [Transition(change.t - TIME_TOLERANCE, end, lag) for end in ends[max(n_over - 1, 0) :]]
+
+    def _are_likelier(self, old: Fit, new: Fit | None, one: Fit | None) -> bool:
+        """Whether two soils have much more evidence than one, of the same data."""
+        if one is None or new is None or not one.converged:
+            return new is not None
+        gain = one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence
+        return gain >= self.options.min_evidence_gain
+
+    def _another_soil(self, present: _Present, one: _Explanation) -> _Explanation:
+        """The window as one soil, a new one where the prior of the present one conflicts with the data."""
+        if not (self.mismatch(one.fit) and self._posteriors):
+            return one
+        joint_prior = present.joint_prior.with_prior_soil(self._new_soil_prior)
+        other = self._search(present.problem, self._new_soil_prior, joint_prior)
+        if self.mismatch(other):
+            return one
+        begin = float(present.problem.t[0])
+        objective = Objective(present.problem, self._new_soil_prior, joint_prior)
+        return _Explanation(objective, other, begin, None, Reason.ANOTHER_SOIL, Transition(begin, begin, 0.0))
+
+    def _after_longer_transition(self, present: _Present, one: _Explanation) -> _Explanation:
+        """The new soil after a longer transition, if the data that it leaves out are why the others do not agree."""
+        if one.fit is None or self._is_settled(one.fit) or one.transition is None:
+            return one
+        prior, joint_prior = one.objective.coordinates.prior, one.objective.joint_prior
+        begin, last = max(one.transition.end, float(present.window.t[0])), float(present.window.t[-1])
+        ends = (begin + share * (last - begin) for share in self.options.extension_shares)
+        longer = (one.transition._replace(end=end) for end in ends)
+        after = self._after_transition(present.window, longer, prior, joint_prior)
+        if after is None or after.fit is None:
+            return one
+        fall = one.fit.neg2_log_posterior - after.fit.neg2_log_posterior - (one.fit.rows - after.fit.rows)
+        return after._replace(found=one.found or Reason.SPANS_BORDER) if fall > self.options.min_evidence_gain else one
+
+    def _search(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
+        """A fit from many starts; None also where the budget allows no search."""
+        if not self._budget.allows():
+            return None
+        work_before = self._budget.work.instants
+        fit = fit_window(problem, prior, joint_prior)
+        self._budget.spend(work_before)
+        return fit
+
+    def _is_settled(self, fit: Fit) -> bool:
+        """Whether the chi-square of a new soil's fit keeps its limit just after a border."""
+        limit = self.settings.max_chi2 + self.options.settled_sd * math.sqrt(2.0 / max(fit.rows, 1))
+        return fit.converged and fit.chi2 <= limit
+
+    def mismatch(self, fit: Fit | None) -> bool:
+        """Whether a fit failed or its chi-square exceeds the limit."""
+        return fit is None or not fit.converged or fit.chi2 > self.chi2_limit(fit)
+
+    def chi2_limit(self, fit: Fit) -> float:
+        """Limit of a fit's reduced chi-square: `max_chi2` + sd sqrt(2 / residuals)."""
+        deviations = 0.0 if self._state.mismatch else self.options.mismatch_sd
+        return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
 
     def _prior_at(self, t: float, problem: ObservationModel) -> Gaussian:
         """Joint prior of a window from t [s] on: soil, gains, and the window's own unknown path curvature."""
@@ -334,26 +671,34 @@ class Tracker:
             return self._initial_prior(problem)
         end, gaussian = self._posteriors[ended[-1]]
         elapsed = (t - end) / self.settings.window
-        gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY_WINDOWS, 1.0)
-        if self._transition is not None and end <= self._transition.end:
-            return gaussian.with_prior_soil(self._soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
+        gains = problem.gain_std**2 * min((elapsed + 1.0) / self.options.gain_memory, 1.0)
+        if self._state.transition is not None and end <= self._state.transition.end:
+            return gaussian.with_prior_soil(self.soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
         form = (
-            None if gaussian.form is None else gaussian.form.drifted(self.settings.form, elapsed / GAIN_MEMORY_WINDOWS)
+            None
+            if gaussian.form is None
+            else gaussian.form.drifted(self.settings.form, elapsed / self.options.gain_memory)
         )
         return replace(gaussian.drifted(self._drift(gaussian, elapsed), gains), form=form)
 
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
         """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
         if self._last_run is not None:
-            joint_prior = prior_from_last_run(self._last_run[0], self._soil_prior, problem.gain_std, self._last_run[1])
-            if passes_prior_conflict_test(problem, self._soil_prior, joint_prior):
+            joint_prior = prior_from_last_run(
+                self._last_run[0],
+                self.soil_prior,
+                problem.gain_std,
+                self._last_run[1],
+                self.options.gain_correlation_time,
+            )
+            if passes_prior_conflict_test(problem, self.soil_prior, joint_prior):
                 return joint_prior
             self._last_run = None
-        return Gaussian.of(self._soil_prior, problem.gain_std)
+        return Gaussian.of(self.soil_prior, problem.gain_std)
 
     def _drift(self, gaussian: Gaussian, elapsed: float) -> Array:
         """Covariance (6, 6) of the drift of the soil's logarithms in `elapsed` windows."""
-        directions = Coordinates(self._soil_prior, float(self.rig.width.mean())).log_directions(gaussian.soil)
+        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(gaussian.soil)
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
     def _ended(self, t: float) -> list[int]:
@@ -364,185 +709,12 @@ class Tracker:
         """Discard posteriors that no window from `start` [s] on can use as prior."""
         self._posteriors = self._posteriors[max([0, *self._ended(start)]) :]
 
-    def mismatch(self, fit: Fit | None) -> bool:
-        """Whether a fit failed or its chi-square exceeds the limit."""
-        return fit is None or not fit.converged or fit.chi2 > self.chi2_limit(fit)
-
-    def chi2_limit(self, fit: Fit) -> float:
-        """Limit of a fit's reduced chi-square: `max_chi2` + `MISMATCH_SD` sqrt(2 / residuals)."""
-        deviations = MISMATCH_SD_AFTER_MISMATCH if self._was_mismatch else MISMATCH_SD
-        return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
-
-    def _change_point_in(
-        self, window: Window, warm: WarmStart, last: Fit, fit: Fit | None, filled: float
-    ) -> ChangePoint | None:
-        """The change point in a window of which the present soil fills `filled` [s]; None without one.
-
-        While nothing explains the data since, the change point stays what it was.
-        """
-        end, length = float(window.t[-1]), self.settings.window
-        if self._change_point is not None and self.mismatch(fit):
-            return self._change_point
-        if self._good_until <= end - length or filled <= MIN_WINDOWS_TO_DETECT * length:
-            return None
-        if fit is not None and fit.curved_path and not self._is_unsettled(fit):
-            return None  # path curvature explains the disagreement
-        t = warm.objective.problem.t
-        first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK_WINDOWS * length))
-        centred = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
-        predicted = centred.drifted(self._drift(centred, DRIFT_SINCE_MIDDLE_WINDOWS), np.zeros(len(centred.gains)))
-        statistic = change_statistic(
-            warm.objective, predicted, warm.iterate, warm.linearisation, first, SUSPECT_LOG_LIKELIHOOD_RATIO
-        )
-        if statistic.ratio <= SUSPECT_LOG_LIKELIHOOD_RATIO and fit is not None and fit.chi2 <= self.chi2_limit(fit):
-            return None
-        begin = float(t[statistic.instant])
-        near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
-        return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed))
-
-    def _fit_two_soils(
-        self, window: Window, change: ChangePoint, one: Fit | None, joint_prior: Gaussian, last: Fit | None
-    ) -> TrackerOutput | None:
-        """The window as two soils, the second from the change point on; None where one soil is not much less likely.
-
-        `one` is the fit of one soil.  Without a last fit, or with too few data of the first soil,
-        the second soil is fitted alone.
-        """
-        first = self._problem(window.rows(np.flatnonzero(window.t < change.t - TIME_TOLERANCE)))
-        warm = None
-        if last is not None and first.n_rows >= MIN_RESIDUALS_PER_SOIL:
-            warm = warm_start(first, self._soil_prior, last, joint_prior)
-        old = None if warm is None else fit_warm(warm)
-        if self.mismatch(old):
-            old = None
-        if old is None and not self.mismatch(one):
-            return None
-        new_prior = new_soil_prior(self.prior)
-        waits = True
-        for transition in self._candidate_transitions(change, float(window.t[0])):
-            separated = without_transition(window, transition, self.rig.front)
-            second = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
-            arrived = transition.end + transition.lag if self._was_mismatch else transition.end
-            if second.n_rows < MIN_RESIDUALS_PER_SOIL or window.t[-1] < arrived:
-                break  # after a mismatch both axles and the draft must agree on the new soil
-            waits = self.mismatch(one) and window.t[-1] < change.t + UNEXPLAINED_WINDOWS * self.settings.window
-            new_joint_prior = self._prior_at(change.t, second).with_prior_soil(new_prior)
-            new = self._search(second, new_prior, new_joint_prior)
-            if new is None or self.mismatch(new):
-                continue
-            if old is not None and not self._two_soils_are_likelier(
-                old, new, self._search_one_soil(separated, self._problem(separated), joint_prior)[1]
-            ):
-                return None
-            self._transition, self._soil_prior = transition, new_prior
-            reported = self._reported(Objective(second, new_prior, new_joint_prior), new)
-            return TrackerOutput(
-                reported, False, self._state_after(transition, reported, float(window.t[-1])), transition.end
-            )
-        if warm is None or old is None or not waits:
-            return None
-        return TrackerOutput(self._reported(warm.objective, old), False, TrackerState.SUSPECT, float(window.t[0]))
-
-    def _candidate_transitions(self, change: ChangePoint, start: float) -> list[Transition]:
-        """Transitions of growing length from the change point on; of those over before `start` [s] only the last."""
-        chassis = self.rig.chassis
-        lag = (DEFAULT_WHEELBASE if chassis is None else chassis.wheelbase) / change.speed
-        ends = [change.t + share * lag for share in TRANSITION_WHEELBASES]
-        n_over = sum(end <= start for end in ends)
-        rear_lag = 0.0 if chassis is None else lag
-        return [Transition(change.t - TIME_TOLERANCE, end, rear_lag) for end in ends[max(n_over - 1, 0) :]]
-
-    def _two_soils_are_likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
-        """Whether two soils have much more evidence than one, of the same data."""
-        return (
-            one is None
-            or not one.converged
-            or one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence >= MIN_EVIDENCE_GAIN
-        )
-
-    def _state_after(self, transition: Transition, fit: Fit | None, end: float) -> TrackerState:
-        """State at `end` [s] after a transition: NEW_SOIL once it is over, else TRANSITION."""
-        length = transition.end - transition.begin
-        sharp = length < transition.lag + self.settings.window / 100.0  # shorter than the vehicle
-        needed = 0.0 if sharp else min(SETTLING_RATIO * length, MIN_WINDOWS_TO_LEARN * self.settings.window)
-        is_over = end - transition.end >= needed and fit is not None and not self._is_unsettled(fit)
-        return TrackerState.NEW_SOIL if is_over else TrackerState.TRANSITION
-
-    def _is_unsettled(self, fit: Fit) -> bool:
-        """Whether the chi-square of a new soil's fit exceeds its limit just after a border."""
-        return not fit.converged or fit.chi2 > self.settings.max_chi2 + TRANSITION_SD * math.sqrt(
-            2.0 / max(fit.rows, 1)
-        )
-
-    def _extend_transition(self, window: Window, objective: Objective, fit: Fit) -> tuple[Objective, Fit]:
-        """The fit after a longer transition, if the data that it leaves out are why the others do not agree."""
-        transition = self._transition
-        assert transition is not None  # only called after one
-        begin = max(transition.end, float(window.t[0]))
-        for end in (begin + share * (float(window.t[-1]) - begin) for share in EXTENSION_SHARES):
-            extended = transition._replace(end=end)
-            separated = without_transition(window, extended, self.rig.front)
-            problem = self._problem(separated.rows(np.flatnonzero(separated.t >= extended.end)))
-            if problem.n_rows < 2 * MIN_RESIDUALS_PER_SOIL:
-                break
-            joint_prior = objective.joint_prior
-            shorter = self._search(problem, self._soil_prior, joint_prior)
-            if shorter is None or self._is_unsettled(shorter):
-                continue
-            fall, noise = fit.neg2_log_posterior - shorter.neg2_log_posterior, fit.rows - shorter.rows
-            if fall > noise + MIN_EXTENSION_GAIN:
-                self._transition = extended
-                return Objective(problem, self._soil_prior, joint_prior), shorter
-        return objective, fit
-
-    def _search_either_soil(
-        self, window: Window, problem: ObservationModel, joint_prior: Gaussian
-    ) -> tuple[Objective, Fit | None]:
-        """A searched fit of one soil: the present one, or a new one where that one's prior conflicts with the data."""
-        objective, fit = self._search_one_soil(window, problem, joint_prior)
-        if self.mismatch(fit) and self._posteriors:
-            new_prior = new_soil_prior(self.prior)
-            new_joint_prior = joint_prior.with_prior_soil(new_prior)
-            other = self._search(problem, new_prior, new_joint_prior)
-            if not self.mismatch(other):
-                begin = float(problem.t[0])
-                self._transition, self._soil_prior = Transition(begin, begin, 0.0), new_prior
-                return Objective(problem, new_prior, new_joint_prior), other
-        return objective, fit
-
-    def _search_one_soil(
-        self, window: Window, problem: ObservationModel, joint_prior: Gaussian
-    ) -> tuple[Objective, Fit | None]:
-        """A searched fit of a window as one soil, the present one."""
-        fit = self._search(problem, self._soil_prior, joint_prior)
-        return self._with_path_curvature(window, Objective(problem, self._soil_prior, joint_prior), fit)
-
-    def _search(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
-        """A fit from many starts; None also where the budget allows no search."""
-        if not self._budget.allows():
-            return None
-        work_before = self._budget.work.instants
-        fit = fit_window(problem, prior, joint_prior)
-        self._budget.spend(work_before)
-        return fit
-
-    def _with_path_curvature(
-        self, window: Window, objective: Objective, fit: Fit | None
-    ) -> tuple[Objective, Fit | None]:
-        """The fit with detected path curvature removed; not just after a border, whose residuals that would hide."""
-        if self._transition is not None and float(window.t[-1]) < self._transition.end + self.settings.window:
-            return objective, fit
-        path = detected_curvature(objective, fit)
-        if fit is None or path is None:
-            return objective, fit
-        return fit_on_curved_path(objective, fit, path, self._problem(straightened(window, self.rig, path)))
-
     def _reported(self, objective: Objective, fit: Fit | None) -> Fit | None:
         """The fit as it is reported: with nested Laplace moments and open form, of the soil at the window's end."""
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
-            off_scale = sinkages_off_scale(objective, fit)
+            off_scale = sinkages_off_scale(objective, fit, self.options.max_scale_statistic)
             fit = with_nested_laplace(objective.problem, objective.coordinates.prior, objective.joint_prior, fit)
             fit = replace(fit, off_scale=off_scale)
         fit = replace(fit, form=self._form_posterior(objective, fit))
@@ -556,39 +728,22 @@ class Tracker:
         with np.errstate(all="ignore"):
             return form_posterior(objective, fit, joint_prior)
 
-    def _stored(self, tracked: TrackerOutput, end: float, problem: ObservationModel) -> TrackerOutput:
-        """Store the result for later windows and return it; a mismatch does not become a prior."""
-        fit = tracked.fit
-        self._fit = None
+    def _store(self, tracked: TrackerOutput, state: SoilState, end: float, problem: ObservationModel) -> None:
+        """Store the result for later windows; a mismatch does not become a prior."""
+        fit, self._state, self._fit = tracked.fit, state, None
         if fit is not None and fit.converged:  # the next window's data have their path curvature again
             self._fit = (
                 fit if fit.curved_path is None else replace(fit, optimum=fit.curved_path.optimum, curved_path=None)
             )
-        if fit is not None:
-            self._was_mismatch = tracked.mismatch
-            self._in_transition = tracked.mismatch and tracked.state is TrackerState.TRANSITION
-        if fit is not None and not tracked.mismatch:
-            self._good_until = end
-            learned = end - tracked.since >= MIN_WINDOWS_TO_LEARN * self.settings.window and fit.is_gaussian
-            if learned and tracked.state in (TrackerState.STEADY, TrackerState.NEW_SOIL):
-                curvature = curvature_of(problem)
-                posterior = without_curvature(fit.mode.likelihood_factor(self._soil_prior), curvature)
-                self._posteriors.append((end, replace(posterior, form=fit.form)))
-                self._newest_posterior = without_curvature(fit.reported, curvature)
-        return tracked
-
-    def _of_present_soil(self, window: Window) -> Window:
-        """The window's data after the last transition."""
-        if self._transition is None:
-            return window
-        window = without_transition(window, self._transition, self.rig.front)
-        return window.rows(np.flatnonzero(window.t >= self._transition.end))
-
-    def _problem(self, window: Window) -> ObservationModel:
-        speed, turn = self.settings.min_speed, self.settings.max_turn
-        problem = ObservationModelWithEffects(window, self.rig, self.model, speed, turn, self.effects, self.free)
-        problem.work = self._budget.work
-        return problem
+        if fit is None or tracked.mismatch:
+            return
+        self._good_until = end
+        learned = end - tracked.since >= self.options.min_to_learn * self.settings.window and fit.is_gaussian
+        if learned and state.name in (TrackerState.STEADY, TrackerState.NEW_SOIL):
+            curvature = curvature_of(problem)
+            posterior = without_curvature(fit.mode.likelihood_factor(self.soil_prior), curvature)
+            self._posteriors.append((end, replace(posterior, form=fit.form)))
+            self._newest_posterior = without_curvature(fit.reported, curvature)
 
 
 class SearchBudget:
@@ -652,7 +807,13 @@ def new_soil_prior(prior: SoilPrior) -> SoilPrior:
     return SoilPrior(prior.median, np.where(prior.log_std > 0.0, np.maximum(prior.log_std, soils.std(0)), 0.0))
 
 
-def prior_from_last_run(gaussian: Gaussian, soil: SoilPrior, gain_std: Array, elapsed: float) -> Gaussian:
+def prior_from_last_run(
+    gaussian: Gaussian,
+    soil: SoilPrior,
+    gain_std: Array,
+    elapsed: float,
+    correlation_time: float = TrackerOptions().gain_correlation_time,
+) -> Gaussian:
     """Joint prior of a run from the posterior of the last one: the soil's prior, and gains drawn back to theirs.
 
     Parameters
@@ -665,17 +826,19 @@ def prior_from_last_run(gaussian: Gaussian, soil: SoilPrior, gain_std: Array, el
         Prior sd of the gains (G,).
     elapsed : float
         Time since then [s].
+    correlation_time : float
+        [s], `TrackerOptions.gain_correlation_time`.
 
     Returns
     -------
     Gaussian
-        Gains k g with variance k^2 var + (1 - k^2) gain_std^2, k = exp(-elapsed / GAIN_CORRELATION_TIME).
+        Gains k g with variance k^2 var + (1 - k^2) gain_std^2, k = exp(-elapsed / correlation_time).
 
     References
     ----------
     Gain errors as a stationary process: Uhlenbeck & Ornstein 1930, Phys. Rev. 36, 823.
     """
-    kept = math.exp(-elapsed / GAIN_CORRELATION_TIME) * (gain_std > 0.0)
+    kept = math.exp(-elapsed / correlation_time) * (gain_std > 0.0)
     covariance = np.zeros_like(gaussian.covariance)
     covariance[:_SOIL, :_SOIL] = np.diag(soil.log_std**2)
     of_gains = kept[:, None] * gaussian.covariance[_SOIL:, _SOIL:] * kept
@@ -701,7 +864,7 @@ def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list
     return problem.gain_names, problem.gain_std
 
 
-def sinkages_off_scale(objective: Objective, fit: Fit) -> bool:
+def sinkages_off_scale(objective: Objective, fit: Fit, max_statistic: float) -> bool:
     """Whether the sinkages of all wheels, or of one wheel, would fit much better times a factor.
 
     Parameters
@@ -710,6 +873,8 @@ def sinkages_off_scale(objective: Objective, fit: Fit) -> bool:
         Of the fitted window.
     fit : Fit
         Its fit.
+    max_statistic : float
+        Score statistic, chi-square with one degree of freedom, above which it is so.
 
     Returns
     -------
@@ -744,4 +909,4 @@ def sinkages_off_scale(objective: Objective, fit: Fit) -> bool:
     information = np.diag(square.sum(axis=0)) - of_information
     scales = np.vstack([np.ones(wheels), np.eye(wheels)[sinkage.any(axis=0)]])
     fall = (scales @ gradient) ** 2 / np.einsum("sw,wv,sv->s", scales, information, scales)
-    return bool(fall.max() > MAX_SCALE_STATISTIC)
+    return bool(fall.max() > max_statistic)

@@ -43,13 +43,13 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
+from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.determination import lacking, sinkage_range
 from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import GapWatch, squares
-from soilbus.pipeline.result import WindowResult, as_of
+from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 
@@ -122,15 +122,14 @@ class WindowEstimator:
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
-        least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
-        self._tracker = tracker_of(
-            self.rig, self.prior, self.model,
-            Settings(
-                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
-                form_of(config), settings.search_rate, settings.search_burst,
-            ),
-            *self._effects_and_parameters,
+        of_tracker = Settings(
+            settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift,
+            form=form_of(config), search_rate=settings.search_rate, search_burst=settings.search_burst,
+            hop=settings.hop,
         )  # fmt: skip
+        if config.table is not None:
+            of_tracker = replace(of_tracker, min_rows=1)  # a table's rows are chosen with care, and few
+        self._tracker = tracker_of(self.rig, self.prior, self.model, of_tracker, *self._effects_and_parameters)
 
     @property
     def tracker(self) -> Tracker:
@@ -181,6 +180,7 @@ class WindowEstimator:
             basis=basis,
             z_driven=None if fit is None or posterior is None else sinkage_range(fit, self.rig),
             search_ended=tracked.search_ended,
+            soil_change=_soil_change(tracked),
             shows_strength=fit is not None and self._shows_strength(fit),
         )
         effects = self._effects(fit)
@@ -381,6 +381,13 @@ class WindowEstimator:
         one, other = fit.mode.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUITY_SD * a.std for a, b in pairs)
+
+
+def _soil_change(tracked: TrackerOutput) -> SoilChange:
+    """Which soil a window is of, and why."""
+    change = None if tracked.change is None else tracked.change.statistic
+    limits = (None, None) if change is None else (change.ratio, change.threshold)
+    return SoilChange(str(tracked.state), str(tracked.reason), *limits)
 
 
 def _gated(tracked: TrackerOutput) -> str:

@@ -124,6 +124,7 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
         "reason": result.reason,
         "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
         "bearing_pressure": bearing,
+        "soil_change": None if result.soil_change is None else result.soil_change._asdict(),
         "soil_class": None if result.soil_class is None else likeliest(result.soil_class),
         "slip": result.slip,
         "sinkage": result.sinkage,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from soilbus.config.model import Config
 from soilbus.decision.immobilisation import Warnings, Watch
@@ -21,6 +21,18 @@ from soilbus.pipeline.positions import Position
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
     from soilbus.estimation.posterior import Estimate, Posterior
+
+
+class SoilChange(NamedTuple):
+    """Which soil a window is of (`tracker.TrackerState`), and why (`tracker.Reason`).
+
+    The change statistic and its threshold are None without a change point.
+    """
+
+    state: str
+    reason: str
+    statistic: float | None
+    threshold: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +75,8 @@ class WindowResult:
         When the warning began, ten times a second.
     log
         Name of the recording; None for the live bus.
+    soil_change
+        Which soil the window is of, and why.
     excitation
         How much draft and slip varied.
     basis
@@ -95,6 +109,7 @@ class WindowResult:
     watch: Watch = Watch()  # noqa: RUF009, immutable
     warnings: Warnings = Warnings()  # noqa: RUF009, immutable
     log: str | None = None
+    soil_change: SoilChange | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
     shows_strength: bool = False

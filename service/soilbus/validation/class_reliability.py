@@ -19,7 +19,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import TYPICAL_DEPTH
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
-from soilbus.estimation.tracker import MISMATCH_SD
+from soilbus.estimation.tracker import TrackerOptions
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
@@ -68,7 +68,11 @@ def windows(count: int, seed: int, seconds: float, slip: float = 0.4) -> Iterato
         truth, soil = drawn(classes, np.random.default_rng([seed, i]))
         problem = None if soil is None else driven(config, soil, [seed, i], seconds, slip)
         fit = None if problem is None else fit_window(problem, prior)
-        if fit is None or not fit.converged or fit.chi2 > 1.1 + MISMATCH_SD * math.sqrt(2.0 / fit.rows):
+        if (
+            fit is None
+            or not fit.converged
+            or fit.chi2 > 1.1 + TrackerOptions().mismatch_sd * math.sqrt(2.0 / fit.rows)
+        ):
             continue  # the service reports such a window as degraded or invalid
         yield Prediction(classes.probabilities(fit.posterior, prior), truth)
 

@@ -1,0 +1,72 @@
+"""The tracker's states: what follows from what a window shows, without any data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from soilbus.estimation.change_detection import ChangeStatistic, Transition
+from soilbus.estimation.tracker import (
+    ChangePoint,
+    Reason,
+    Shown,
+    SoilState,
+    TrackerOptions,
+    TrackerState,
+    next_state,
+)
+
+LENGTH = 10.0
+SHARP, GRADUAL = Transition(20.0, 20.5, 1.3), Transition(20.0, 24.0, 1.3)
+CHANGE = ChangePoint(20.0, 1.5, ChangeStatistic(180, 31.0, 8.0))
+QUIET = Shown(None, None, None, mismatch=False, settled=True)
+
+
+def after(state: SoilState, shown: Shown, end: float) -> tuple[TrackerState, Reason]:
+    following = next_state(state, shown, end, LENGTH, TrackerOptions())
+    return following.name, following.reason
+
+
+@pytest.mark.parametrize(
+    ("shown", "reason"),
+    [
+        (QUIET, Reason.ONE_SOIL),
+        (QUIET._replace(mismatch=True, settled=False), Reason.MISMATCH),
+        (QUIET._replace(change=CHANGE), Reason.UNCONFIRMED),
+    ],
+)
+def test_without_another_soil_it_stays_the_same(shown, reason):
+    assert after(SoilState(), shown, 15.0) == (TrackerState.STEADY, reason)
+
+
+def test_a_change_with_too_few_data_is_suspect_and_remembered():
+    shown = QUIET._replace(found=Reason.CHANGE_STATISTIC, change=CHANGE)
+    following = next_state(SoilState(), shown, 21.0, LENGTH, TrackerOptions())
+    assert (following.name, following.reason) == (TrackerState.SUSPECT, Reason.CHANGE_STATISTIC)
+    assert following.change == CHANGE
+    assert following.transition is None
+
+
+def test_a_sharp_border_is_over_at_once_and_a_gradual_one_when_the_soil_has_lasted():
+    found = QUIET._replace(found=Reason.TWO_SOILS, transition=SHARP)
+    assert after(SoilState(), found, 21.0) == (TrackerState.NEW_SOIL, Reason.TWO_SOILS)
+    gradual = found._replace(transition=GRADUAL)
+    assert after(SoilState(), gradual, 25.0) == (TrackerState.TRANSITION, Reason.TOO_SHORT)
+    assert after(SoilState(), gradual, 29.5) == (TrackerState.NEW_SOIL, Reason.TWO_SOILS)
+
+
+def test_a_border_is_not_over_while_its_soil_does_not_fit_however_late():
+    crossing = SoilState(TrackerState.TRANSITION, Reason.UNSETTLED, SHARP, mismatch=True)
+    unsettled = QUIET._replace(transition=SHARP, mismatch=True, settled=False)
+    for end in (22.0, 29.0, 45.0):
+        assert after(crossing, unsettled, end) == (TrackerState.TRANSITION, Reason.UNSETTLED)
+    # A window that fits and has no data before the border ends it.
+    fitted = replace(crossing, mismatch=False)
+    assert after(fitted, QUIET._replace(transition=SHARP), 45.0) == (TrackerState.STEADY, Reason.ONE_SOIL)
+
+
+def test_a_new_soil_is_new_for_a_window_and_then_the_same():
+    new, shown = SoilState(TrackerState.NEW_SOIL, Reason.TWO_SOILS, SHARP), QUIET._replace(transition=SHARP)
+    assert after(new, shown, 30.0) == (TrackerState.NEW_SOIL, Reason.SPANS_BORDER)
+    assert after(new, shown, 30.6) == (TrackerState.STEADY, Reason.ONE_SOIL)
