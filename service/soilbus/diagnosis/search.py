@@ -24,7 +24,6 @@ from soilbus.diagnosis.score import Score, further_scores, scores
 from soilbus.diagnosis.verdict import (
     dominated_deficit,
     gap_limit,
-    least_required_fall,
     mean_soil_error_share,
     probabilities,
     required_fall,
@@ -95,7 +94,7 @@ class Search:
     def steps(self) -> Iterator[tuple[list[Addition], FittedModel]]:
         """After each addition and its swaps: the additions in the order of the model's effects, and the model."""
         present = self.base
-        while len(self.added(present)) < self.options.max_effects and self._leaves_enough(present):
+        while len(self.added(present)) < self.options.max_effects:
             wider = self.best(present)
             if wider is None or self._falls_short(present, wider):
                 return
@@ -200,11 +199,6 @@ class Search:
         if len(kept) == len(self.base.effects):
             return self.base
         return self.full.fit(kept, [[start._replace(near_optimum=False) for start in model.as_starts(kept)]])
-
-    def _leaves_enough(self, model: FittedModel) -> bool:
-        """Whether what a model leaves unexplained, or noise may hide of it, reaches the least required fall."""
-        hidden = self.options.gap_limit_sd * math.sqrt(2.0 * model.rows)
-        return model.excess + hidden > least_required_fall(self.temperature)
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
         """Whether an effect explains less than the required fall."""
