@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.moments import moments_along_share
-from soilbus.estimation.options import PosteriorOptions
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.terra.soils import SOILS
 
@@ -52,7 +51,7 @@ def by_grid(quadratic, gradient, share):
 @pytest.mark.parametrize("miss", [-1.0, 1.0])
 def test_moments_equal_the_integrals_over_both_unknowns(share, miss):
     quadratic, gradient = problem(share, 0.08, miss=miss)
-    found = moments_along_share(quadratic, gradient, share, PosteriorOptions())
+    found = moments_along_share(quadratic, gradient, share)
     mean, covariance = by_grid(quadratic, gradient, share)
     std = np.sqrt(np.diag(covariance))
     assert found.mean / std == pytest.approx(mean / std, abs=0.003)
@@ -62,7 +61,7 @@ def test_moments_equal_the_integrals_over_both_unknowns(share, miss):
 def test_a_share_that_the_data_determine_has_mode_and_curvature():
     share = 0.2
     quadratic, gradient = problem(share, 0.002)
-    found = moments_along_share(quadratic, gradient, share, PosteriorOptions())
+    found = moments_along_share(quadratic, gradient, share)
     at = np.zeros((4, 2))
     at[:3, 0], at[3, 1] = (1.0, 1.0, -share / (1.0 - share)), 1.0
     expected = np.linalg.inv(at.T @ quadratic @ at)
@@ -74,7 +73,7 @@ def test_a_share_that_the_data_determine_has_mode_and_curvature():
 def test_a_share_that_the_data_leave_open_has_the_prior():
     share = 1e-4
     quadratic, gradient = problem(share, 1.0)
-    found = moments_along_share(quadratic, gradient, share, PosteriorOptions())
+    found = moments_along_share(quadratic, gradient, share)
     assert found.mean[0] == pytest.approx(0.0, abs=0.01)
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(1.2, rel=0.01)
 
@@ -82,7 +81,7 @@ def test_a_share_that_the_data_leave_open_has_the_prior():
 def test_there_are_no_moments_where_another_unknown_is_not_determined():
     quadratic, gradient = problem(0.1, 0.05)
     quadratic[3] = quadratic[:, 3] = 0.0
-    assert moments_along_share(quadratic, gradient, 0.1, PosteriorOptions()) is None
+    assert moments_along_share(quadratic, gradient, 0.1) is None
 
 
 def test_coordinates_and_back(simulated):

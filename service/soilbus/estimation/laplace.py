@@ -277,10 +277,7 @@ def _one_side(
     """
     nodes: list[Node] = []
     last, least, options = top, top.neg2_log_density, problem.options.posterior
-    for _ in range(options.max_nodes):
-        node = _node(problem, prior, joint_prior, last.fit, last.u + step, slope)
-        if node is None:
-            break
+    while (node := _node(problem, prior, joint_prior, last.fit, last.u + step, slope)) is not None:
         nodes.append(node)
         slope = (_logs_and_gains(node.fit) - _logs_and_gains(last.fit)) / (node.u - last.u)
         last, least, step = node, min(least, node.neg2_log_density), step * options.node_step_growth
@@ -329,7 +326,7 @@ def _averaged(
     active = _SOIL + np.flatnonzero(np.diag(joint_prior.covariance)[_SOIL:] > 0.0)
     gaussians = [node.fit.gaussian for node in nodes]
     u = np.array([node.u for node in nodes])
-    fine = np.linspace(u[0], u[-1], options.grid_points)
+    fine = np.linspace(u[0], u[-1], 400)
     by_density = density(u, np.array([node.neg2_log_density for node in nodes]), fine)
     by_confidence = confidence(u, np.array([node.neg2_log_profile for node in nodes]), fine)
     interpolation = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])

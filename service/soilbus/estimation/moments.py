@@ -22,7 +22,6 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
-from soilbus.estimation.options import PosteriorOptions
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 
@@ -58,7 +57,7 @@ def gaussians_at(
     -------
     moments, mode
         By the curvature where there are no finite moments; along k_c's share also where k_c and k_phi are not
-        both free, or the sd of log K_L exceeds `max_modulus_sd`.  None where the information is singular.
+        both free  None where the information is singular.
     """
     inverse = solve_with_inverse(model.information, model.gradient)
     if inverse is None:
@@ -66,7 +65,6 @@ def gaussians_at(
     covariance = inverse[1]
     mode = objective.gaussian(iterate.soil, iterate.gains, covariance, base)
     free, has_share = len(objective.free), {_K_C, _K_PHI} <= set(objective.free.tolist())
-    has_share = has_share and bool(covariance[_K_PHI, _K_PHI] <= objective.problem.options.posterior.max_modulus_sd**2)
     along_share = _moments_along_share(objective, iterate, model, base) if has_share else None
     along_c = _moments_along_c(objective, iterate, model, base)
     if along_share is None and along_c is None:
@@ -115,7 +113,7 @@ def _moments_along_c(objective: Objective, iterate: Iterate, model: QuadraticMod
     gradient = np.zeros(len(quadratic))  # at the optimum the data's gradient is minus the prior's
     gradient[_LOG_SHARE] = weighted[:, _LOG_SHARE] @ objective.prior_factor.residuals(iterate.soil, iterate.gains)
     gradient[_SHARE] = -gradient[_LOG_SHARE]
-    found = moments_along_share(quadratic, gradient, 1e-12, objective.problem.options.posterior)
+    found = moments_along_share(quadratic, gradient, 1e-12)
     if found is None:
         return None
     back = np.argsort(order)
@@ -146,7 +144,7 @@ def _moments_along_share(objective: Objective, iterate: Iterate, model: Quadrati
     )
     gradient = np.zeros(len(quadratic))  # at the optimum the data's gradient is minus the prior's
     gradient[:_OTHERS] = of_prior[_LOG_REST] * share / (1.0 - share) - of_prior[_LOG_SHARE], *of_prior[1:_OTHERS]
-    return moments_along_share(quadratic, gradient, share, objective.problem.options.posterior)
+    return moments_along_share(quadratic, gradient, share)
 
 
 def _by_share(objective: Objective, soil: Array) -> Array:
@@ -166,7 +164,7 @@ def _root_of(covariance: Array) -> Array:
     return np.asarray(scale[:, None] * (axes * np.sqrt(np.maximum(variance, 1e-300))) @ axes.T)
 
 
-def moments_along_share(quadratic: Array, gradient: Array, share: float, options: PosteriorOptions) -> Moments | None:
+def moments_along_share(quadratic: Array, gradient: Array, share: float) -> Moments | None:
     """Moments of a posterior along k_c's share.
 
     Parameters
@@ -177,8 +175,6 @@ def moments_along_share(quadratic: Array, gradient: Array, share: float, options
         Half the gradient at the mode: -2 log posterior is z' quadratic z + 2 gradient' z, up to a constant.
     share
         s at the mode.
-    options
-        Of the integral over s.
 
     Returns
     -------
@@ -197,7 +193,7 @@ def moments_along_share(quadratic: Array, gradient: Array, share: float, options
         return None
     along = -inverse @ quadratic[3:, :3]
     of_share = quadratic[:3, :3] + quadratic[:3, 3:] @ along
-    first, second = _over_share(of_share, gradient[:3] + along.T @ gradient[3:], share, options)
+    first, second = _over_share(of_share, gradient[:3] + along.T @ gradient[3:], share)
     spread = np.vstack([[0.0, 1.0, 0.0], along])
     mean, covariance = spread @ first, spread @ second @ spread.T
     mean[1:] -= inverse @ gradient[3:]
@@ -205,7 +201,7 @@ def moments_along_share(quadratic: Array, gradient: Array, share: float, options
     return Moments(mean, covariance) if np.isfinite(covariance).all() else None
 
 
-def _over_share(quadratic: Array, gradient: Array, share: float, options: PosteriorOptions) -> tuple[Array, Array]:
+def _over_share(quadratic: Array, gradient: Array, share: float) -> tuple[Array, Array]:
     """Mean (3,) of the changes of s, log s and log (1 - s), and covariance (3, 3) about it.
 
     The mean is over log k_c and log k_phi, as in the prior.  The covariance has Jeffreys' measure, the root of
@@ -214,12 +210,12 @@ def _over_share(quadratic: Array, gradient: Array, share: float, options: Poster
     """
     at_mode = np.array([1.0, 1.0, -share / (1.0 - share)])
     scale = 1.0 / np.sqrt(at_mode @ quadratic @ at_mode)
-    half_width = np.arcsinh(options.share_half_width_sd / np.sqrt(quadratic[1, 1]) / scale)
-    nodes = np.linspace(-half_width, half_width, options.share_nodes)
-    d = np.minimum(scale * np.sinh(nodes), np.log(options.max_share / share))
+    half_width = np.arcsinh(6.0 / np.sqrt(quadratic[1, 1]) / scale)
+    nodes = np.linspace(-half_width, half_width, 81)
+    d = np.minimum(scale * np.sinh(nodes), np.log(0.99 / share))
     rest = 1.0 - share * np.exp(d)
     changes = np.stack([np.expm1(d), d, np.log(rest / (1.0 - share))])
-    slopes = np.stack([np.exp(d), np.ones(options.share_nodes), 1.0 - 1.0 / rest])
+    slopes = np.stack([np.exp(d), np.ones(len(nodes)), 1.0 - 1.0 / rest])
     neg2_log = (changes * (quadratic @ changes)).sum(0) + 2.0 * gradient @ changes
     density = np.cosh(nodes) * (scale * np.sinh(nodes) <= d) * np.exp(-0.5 * (neg2_log - neg2_log.min()))
     by_prior = density / rest

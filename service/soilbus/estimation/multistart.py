@@ -193,12 +193,12 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
     thin = Objective(problem.thinned(options.thinned), prior, joint_prior, as_measured=True)
     with np.errstate(all="ignore"):
         ends = _search(thin)
-        best, origin = _best(objective, ends)
+        best = _joint_fit(objective, ends[0]) if ends else None
         if best is None or best.chi2 > options.plausible_chi2:
             return best
         if not best.converged:
             return refit_denoised(objective, best)
-        return _with_second_mode(objective, thin, best, ends, origin)
+        return _with_second_mode(objective, thin, best, ends)
 
 
 def fit_from_soil(
@@ -350,16 +350,18 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
 
 
 def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
-    """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, further ones of the table.
+    """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, the second likeliest.
 
     See `soil_classes.ranked_by_likelihood`.
     """
     options = problem.options.search
     yield Soil(*(prior.median if joint_prior is None else joint_prior.soil).tolist())
-    likeliest, *others = ranked_by_likelihood(problem, [clip_to_prior(prior, SOILS[kind], options) for kind in KINDS])
+    likeliest, second, *_ = ranked_by_likelihood(
+        problem, [clip_to_prior(prior, SOILS[kind], options) for kind in KINDS]
+    )
     yield likeliest
     yield clip_to_prior(prior, SOILS["loam"], options)
-    yield from others[: options.max_kinds - 1]
+    yield second
 
 
 def clip_to_prior(prior: SoilPrior, soil: Soil, options: SearchOptions) -> Soil:
@@ -402,44 +404,29 @@ def _end_from(thin: Objective, soil: Array) -> _End | None:
     return _End(end.previous.soil, end.previous.gains, end.model.neg2_log_posterior, end.evaluations)
 
 
-def _best(objective: Objective, ends: Sequence[_End]) -> tuple[Fit | None, _End | None]:
-    """The first fit that converges from the distinct ends of the search, else the best, and the end it started from."""
-    options = objective.options
-    apart = 1.0 + options.same_end_ratio
-    distinct = [end for i, end in enumerate(ends) if i == 0 or end.value > apart * ends[i - 1].value]
-    best, origin = None, None
-    for end in distinct[: options.max_joint_descents]:
-        descent = options.cold
-        if not end.value < options.implausible * options.thinned:
-            descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
-        fit = fit_at(
-            objective, minimise(objective, objective.start(end.soil, gains=end.gains), descent), end.evaluations
-        )
-        if fit is not None and (
-            best is None or (fit.converged, -fit.neg2_log_posterior) > (best.converged, -best.neg2_log_posterior)
-        ):
-            best, origin = fit, end
-        if best is not None and best.converged:
-            break
-    return best, origin
+def _joint_fit(objective: Objective, end: _End) -> Fit | None:
+    """The fit to all instants from an end of the search; None where the numbers are not finite."""
+    options, start = objective.options, objective.start(end.soil, gains=end.gains)
+    descent = options.cold
+    if not end.value < options.implausible * options.thinned:
+        descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
+    return fit_at(objective, minimise(objective, start, descent), end.evaluations)
 
 
-def _with_second_mode(
-    objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End], origin: _End | None
-) -> Fit:
+def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> Fit:
     """The likelier of an optimum and another one, with the other as its second mode.
 
-    The candidate is an end of the search other than `origin`, from which `found` was reached, or the soil
+    The candidate is an end of the search other than the first, from which `found` was reached, or the soil
     with k_c's other share.  There is no second mode where its share of the probability is below `min_mode_share`
     or the two are less than `distinct_sd` apart.  Both then are by mode and curvature: the moments along
     k_c's share would count the other mode twice.
     """
     options = objective.options
     has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
-    end = _other_end(objective, thin, found, ends, origin) if has_two_widths else None
+    end = _other_end(objective, thin, found, ends) if has_two_widths else None
     if end is None:
         return found
-    other = fit_at(objective, minimise(objective, objective.start(end.soil, gains=end.gains), options.cold))
+    other = _joint_fit(objective, end)
     if other is None or not other.converged:
         return found
     better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
@@ -450,10 +437,8 @@ def _with_second_mode(
     return replace(better, gaussian=better.mode, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
 
 
-def _other_end(
-    objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End], origin: _End | None
-) -> _End | None:
-    """The end of a descent on a few instants that is about as low as `found` there, and far from it."""
+def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:
+    """The best end of a descent on a few instants that is far from `found`."""
     options = objective.options
     is_k_c_open = math.sqrt(found.mode.covariance[_K_C, _K_C]) > options.determined_k_c_sd
     has_several_ends = len({end.soil.tobytes() for end in ends}) > 1
@@ -467,22 +452,14 @@ def _other_end(
         off[: len(position)] = thin.coordinates.position(end.soil) - position
         return here.squared_length(off)
 
-    def is_elsewhere(end: _End) -> bool:
-        is_low = end.value < options.second_mode_ratio * here.neg2_log_posterior
-        return is_low and squared_distance(end) > options.other_optimum_sd**2
-
-    def is_origin(end: _End) -> bool:
-        return origin is not None and np.array_equal(end.soil, origin.soil)
-
-    nearest = min(map(squared_distance, ends))
-    other = next(
-        (end for end in ends if is_elsewhere(end) and squared_distance(end) > nearest and not is_origin(end)), None
-    )
+    away = options.other_optimum_sd**2
+    least = max(away, min(map(squared_distance, ends)))
+    other = next((end for end in ends[1:] if squared_distance(end) > least), None)
     start = objective.coordinates.with_other_share(found.mode.soil) if is_k_c_open and other is None else None
     if start is None:
         return other
     end = _end_from(thin, start)
-    return end if end is not None and is_elsewhere(end) else None
+    return end if end is not None and squared_distance(end) > away else None
 
 
 def _cold_fit(objective: Objective, near: Solution) -> Fit | None:

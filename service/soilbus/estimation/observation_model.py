@@ -501,15 +501,15 @@ class ObservationModel(Measurements):
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
         """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
-        free, options = self.rolls, self.options.measurements
+        free = self.rolls
         if not free.any():
             return np.zeros((self.n, 0))
         rim = self.rig.radius[free] * latents.speed[:, free]
         ratio = latents.ground_speed[:, None] / rim  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        limit = options.max_skid_step
+        limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
         step = np.where(by_slip > 0.0, -at.value[1][:, free] / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
-        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -options.max_skid, 0.0))
+        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -0.5, 0.0))
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
@@ -789,7 +789,7 @@ class ObservationModel(Measurements):
     def _rolled(self, latents: Latents, soil: Soil) -> Latents:
         """The latents with the speeds and entry angles at which the free wheels need no torque, nearly."""
         free, no_gains = self.rolls, np.zeros(self.n_sensors)
-        for _ in range(self.options.measurements.skid_rounds):
+        for _ in range(4):  # each linearisation adds one
             at = ObservationModel._response(self, soil, no_gains, latents)
             slip, speed, angle = self._rolling_slip(at, latents), latents.speed.copy(), latents.entry_angle.copy()
             before = 1.0 - latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])
@@ -1157,10 +1157,10 @@ class ObservationModelWithEffects(ObservationModel):
         off = excess(angle)
         with np.errstate(all="ignore"):
             slope = (2.0 * soil.n + 1.0) * base.load  # by the angle's logarithm, for small angles; then secants
-            for _ in range(self.options.measurements.max_load_iterations):
+            for _ in range(6):
                 step = np.where(slope > 0.0, -off / slope, 0.0)
                 new_angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
-                if np.abs(step).max(initial=0.0) < self.options.measurements.angle_tolerance:
+                if np.abs(step).max(initial=0.0) < 0.01:
                     angle = new_angle
                     break
                 new_excess = excess(new_angle)

@@ -22,32 +22,10 @@ class MeasurementOptions:
     """Slip [1] from which a wheel is unusable; no evidence recorded."""
     min_slip: float = -1.0
     """Slip [1] (braking) up to which a wheel is unusable; no evidence recorded."""
-    max_rim_difference: float = 1.0
-    """Relative difference of rim speeds [1] of a turn about a centre one track from the vehicle's middle: B/R = 1.
-    Steered tractors turn about centres at least 1.5 tracks away; one side that spins while the other stands is at 2."""
-    max_axle_ratio: float = 2.0
-    """Greatest ratio [1] of the axles' relative differences in one turn.  The front axle's is less by the square of
-    the cosine of the steering angle (1/2 at 45 degrees); the inner wheels of both axles slip about alike."""
-    min_track: float = 0.3
-    """Track [m] of the smallest wheeled vehicles, rovers."""
-    max_track: float = 8.0
-    """Track [m] of the widest, 3.2 m, over 1 - slip for slips up to 0.6."""
-    least_sliding: float = 0.05
-    """Slip [1] that sliding along counts at least: below it a wheel's forces are small in both directions."""
     cubic_selection_sd: float = 6.0
     """Sd of the noise by which cubics through ground speeds must differ from lines to be used; no evidence recorded."""
-    max_skid: float = 0.5
-    """Largest skid [1] (minus slip) of a free wheel, as in the capability."""
-    max_skid_step: float = 0.05
-    """Largest change of it [1] in one step: its torque is curved within K over the contact's length of zero."""
-    skid_rounds: int = 4
-    """Newton steps to the first slips of free wheels; each linearisation adds one."""
     load_tolerance: float = 0.02
     """Relative error of load [1] accepted in the first entry angles; each linearisation reduces it further."""
-    max_load_iterations: int = 6
-    """Secant steps to the entry angles that carry the loads under effects; no evidence recorded."""
-    angle_tolerance: float = 0.01
-    """Relative step of an entry angle [1] after which these steps end; no evidence recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,22 +67,15 @@ class SearchOptions:
 
     thinned: int = 24
     """Instants of a window that the search for starts uses; no evidence recorded."""
-    max_kinds: int = 2
-    """Soils of the table that the search starts from; no evidence recorded."""
-    ranking_instants: int = 6
-    """Instants of a window by which soils of the table are ranked; no evidence recorded."""
-    ranking_sd: float = 0.1
-    """Relative sd of torque, pull and sinkage about those of a soil of the table [1]: a field is not the table's."""
     start_prior_sd: float = 2.0
-    """How far a start may be from the prior's median [prior sd]; no evidence recorded."""
+    """How far a start may be from the prior's median [prior sd]; with 4, the bounds, border windows end elsewhere."""
     same_end_ratio: float = 0.02
     """Relative difference of two objectives [1] below which two descents have met; no evidence recorded."""
     plausible_chi2: float = 3.0
     """Objective per residual [1] up to which an optimum of the search may be the soil's; no evidence recorded."""
-    max_joint_descents: int = 2
-    """Ends of the search from which all instants are fitted; no evidence recorded."""
     implausible: float = 60.0
-    """Objective per thinned instant [-2 log] above which a window cannot be of one soil; no evidence recorded."""
+    """Objective per thinned instant [-2 log] above which a window cannot be of one soil.  Without this limit the
+    budget of a border's search is gone before another soil is found."""
     max_implausible_evaluations: int = 5
     """Evaluations from an end whose objective exceeds `implausible`; no evidence recorded."""
     as_measured_ratio: float = 2.5
@@ -112,12 +83,6 @@ class SearchOptions:
     determined_k_c_sd: float = 0.6
     """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it; no
     evidence recorded."""
-    low_share: float = 0.03
-    """Share of k_c in K_L [1] below what most windows can distinguish from zero; no evidence recorded."""
-    high_share: float = 0.4
-    """Share of k_c in K_L [1] above it; no evidence recorded."""
-    second_mode_ratio: float = 1.5
-    """Ratio of objectives on a few instants [1] above which an end is no second mode; no evidence recorded."""
     other_optimum_sd: float = 10.0
     """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum; no evidence recorded."""
     distinct_sd: float = 2.0
@@ -128,12 +93,8 @@ class SearchOptions:
     """Sinkage [m] at which the bearing pressure is a coordinate; no evidence recorded."""
     max_log_step: float = 0.7
     """Longest step of a coordinate [1, a logarithm]: a factor of two; no evidence recorded."""
-    min_tan_ratio: float = 0.2
-    """Least ratio [1] of tan phi after a step to that before."""
     bound_sd: float = 4.0
     """Bound of a free parameter's logarithm about the prior median [prior sd]; no evidence recorded."""
-    min_k_phi_share: float = 0.01
-    """Least share of k_phi in K_L [1] that coordinates are converted to: k_phi is positive."""
     max_angle_change: float = 0.2
     """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated; no
     evidence recorded."""
@@ -154,15 +115,6 @@ class SearchOptions:
 class PosteriorOptions:
     """What a fit's posterior is: moments, average along n, drift, path curvature, form, soil classes."""
 
-    max_modulus_sd: float = 0.5
-    """Sd of log K_L at the typical depth [1] above which k_c and k_phi are each known by the prior alone: the moments
-    along k_c's share are not worked out there; no evidence recorded."""
-    share_nodes: int = 81
-    """Nodes of the integral over k_c's share; no evidence recorded."""
-    share_half_width_sd: float = 6.0
-    """Half width of that integral [prior sd of log s]; no evidence recorded."""
-    max_share: float = 0.99
-    """Upper end of that integral [1]: share of k_c in K_L."""
     determined_n_sd: float = 0.05
     """Sd of log n [1] below which a posterior with one mode counts as Gaussian; no evidence recorded."""
     min_load_signal: float = 4.0
@@ -172,12 +124,8 @@ class PosteriorOptions:
     """Longest first step of log n [1] from the mode; no evidence recorded."""
     node_step_growth: float = 1.4
     """Ratio [1] of each step of log n to the one before; no evidence recorded."""
-    max_nodes: int = 12
-    """Nodes on either side of the mode; no evidence recorded."""
     negligible: float = 9.0
     """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
-    grid_points: int = 400
-    """Values of n between the first and the last node that are averaged; no evidence recorded."""
     error_power: float = 1.0
     """Power [1] of the attainable sd of a soil by which an error counts less there.  With 2 the mean square error is
     least in units of what is attainable on each soil, with 0 that of the logarithm."""

@@ -73,7 +73,7 @@ class Coordinates:
         soil[free] = np.exp(position)
         if _K_PHI in self._column:
             K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * self.log_depth)
-            soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, self.options.min_k_phi_share * K_L)
+            soil[_K_PHI] = K_L - soil[_K_C] / self.width
         return self.within(soil)
 
     def log_directions(self, soil: Array) -> Array:
@@ -126,7 +126,7 @@ class Coordinates:
         if _PHI in self._column:
             phi, tan = float(soil[_PHI]), math.tan(soil[_PHI])
             change = phi * (1.0 + tan**2) * float(step[self._column[_PHI]])
-            new[_PHI] = math.atan(max(tan + change, self.options.min_tan_ratio * tan))
+            new[_PHI] = math.atan(tan + change)
         return self.within(new)
 
     def step_fraction(self, soil: Array, step: Array) -> float:
@@ -172,7 +172,7 @@ class Coordinates:
         if not {_K_C, _K_PHI} <= self._column.keys():
             return None
         K_L = soil[_K_PHI] + soil[_K_C] / self.width
-        low, high = self.options.low_share, self.options.high_share
+        low, high = 0.03, 0.4  # on either side of what most windows can distinguish from zero
         share = low if soil[_K_C] / self.width > math.sqrt(low * high) * K_L else high
         other = soil.copy()
         other[_K_C], other[_K_PHI] = share * K_L * self.width, (1.0 - share) * K_L

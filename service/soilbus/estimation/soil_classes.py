@@ -164,17 +164,16 @@ def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> li
     Parameters
     ----------
     problem
-        A window; `ranking_instants` of it are used, with loads and slips as measured.
+        A window; six instants of it are used, with loads and slips as measured.
     soils
         In SI.
 
     Notes
     -----
     The misfit is the sum of squares of predicted less measured torque, pull and sinkage over
-    `ranking_sd` of their size.
+    a tenth of their size: a field is not the table's.
     """
-    options = problem.options.search
-    few, sd = problem.thinned(options.ranking_instants), options.ranking_sd
+    few, sd = problem.thinned(6), 0.1
     radius, shape = few.rig.radius, (len(soils), *few.load.shape)
     each = Soil(*np.array(soils).T[:, :, None, None])
     slip = np.broadcast_to(np.where(few.usable, few.slip, 0.0), shape)

@@ -244,18 +244,18 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
 
     Without a yaw rate the rim speeds decide.  In a turn the wheels of the same side are the
     faster ones on every axle, by relative differences that are equal up to the influence of
-    steering angle and tracks, and no greater than in a turn about a centre one track away.  All
+    steering angle (1/2 at 45 degrees) and tracks, and no greater than in a turn about a centre one track away: steered
+    tractors turn about centres at least 1.5 tracks away, and one side that spins while the other stands is at 2.  All
     other patterns are slip: of one wheel, of one on each axle crosswise (open differentials), of
     all on one side while the others stand, or of one axle on a side slope.  An axle with an
     unknown speed or without two wheels is ignored; without any axle no instant is in a turn.
     """
-    options = rig.options.measurements
     relative, difference = _rim_differences(window, rig)
     size = np.abs(relative)
     smallest, largest = np.fmin.reduce(size, axis=1, initial=np.inf), np.fmax.reduce(size, axis=1, initial=0.0)
     same_sign = np.abs(np.nansum(np.sign(relative), axis=1)) == np.isfinite(relative).sum(axis=1)
-    by_rims = np.isfinite(smallest) & (smallest > max_turn) & (largest < options.max_rim_difference)
-    by_rims &= (largest < options.max_axle_ratio * smallest) & same_sign
+    by_rims = np.isfinite(smallest) & (smallest > max_turn) & (largest < 1.0)  # B/R = 1
+    by_rims &= (largest < 2.0 * smallest) & same_sign
     yaw = window.yaw_rate
     if rig.max_lateral is not None and rig.chassis is not None:
         by_rims |= _slides(window, rig, rig.max_lateral, difference)
@@ -266,7 +266,7 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
             by_yaw = rig.track * np.abs(yaw) > max_turn * np.abs(window.ground_speed)
         else:
             track = difference / yaw[:, None]  # of the axle, if the difference is the turn's alone
-            possible = np.isnan(track) | ((track > options.min_track) & (track < options.max_track))
+            possible = np.isnan(track) | ((track > 0.3) & (track < 8.0))  # from a small rover to 3.2 m over 1 - slip
             by_yaw = by_rims & possible.all(axis=1)
     if rig.max_lateral is not None:
         by_yaw = by_yaw | by_rims
@@ -288,8 +288,8 @@ def _slides(window: Window, rig: Rig, max_lateral: float, difference: Array) -> 
     rim = rig.radius * window.speed
     known = np.isfinite(rim)
     mean = np.where(known, rim, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    least = rig.options.measurements.least_sliding * np.abs(window.ground_speed)
-    along = np.maximum(np.abs(mean - window.ground_speed), least)
+    # below a slip of 0.05 a wheel's forces are small in both directions
+    along = np.maximum(np.abs(mean - window.ground_speed), 0.05 * np.abs(window.ground_speed))
     with np.errstate(invalid="ignore"):
         return np.asarray(yaw * rig.chassis.wheelbase / 2.0 > max_lateral * along)
 
