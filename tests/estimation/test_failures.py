@@ -130,7 +130,7 @@ def test_an_ambiguous_window_says_so_and_never_go():
     problem = local_optima.window(config, "wet_clay", seed=3)
     fit = fit_window(problem, prior_of(config))
     one, other = (
-        fit.posterior.bearing_pressure(0.02, 0.3),
+        fit.mode.posterior.bearing_pressure(0.02, 0.3),
         fit.second_mode.gaussian.posterior.bearing_pressure(0.02, 0.3),
     )
     assert abs(one.value - other.value) > 2.0 * one.std

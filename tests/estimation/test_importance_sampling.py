@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,7 @@ from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.wheel import Soil
-from soilbus.validation import importance_sampling, local_optima
+from soilbus.validation import local_optima
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import sample_posterior
 
@@ -60,27 +58,6 @@ def test_the_average_along_n_has_the_moments_of_the_sampled_posterior(uncertain)
     ratio = np.sqrt(np.diag(back @ reported.covariance[:6, :6] @ back.T)) / std
     assert ratio.min() > 1.0 - 0.1 - chance / np.sqrt(2.0)
     assert ratio.max() < 1.5
-
-
-def test_without_deviation_along_k_c_s_share_the_draws_are_by_the_curvature(uncertain, monkeypatch):
-    problem, prior, joint_prior, fit = uncertain
-    along = profile_over_n(problem, prior, joint_prior, fit)
-
-    def without_deviation(node):
-        """As where k_c's share is close to zero: the logarithms of k_c and k_phi change together."""
-        covariance = node.fit.gaussian.covariance.copy()
-        covariance[0], covariance[:, 0] = covariance[1], covariance[:, 1]
-        covariance[0, 0] = covariance[1, 1]
-        return node._replace(fit=replace(node.fit, gaussian=replace(node.fit.gaussian, covariance=covariance)))
-
-    flat = along._replace(nodes=[without_deviation(node) for node in along.nodes])
-    first = sample_posterior(problem, prior, joint_prior, fit, 1500, np.random.default_rng(1))
-    monkeypatch.setattr(importance_sampling, "profile_over_n", lambda *_: flat)
-    again = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(2))
-    (mean, std), (other, _) = (moments(found) for found in (first, again))
-    chance = 3.5 * np.sqrt(1.0 / first.effective + 1.0 / again.effective)
-    assert again.effective > 30.0
-    assert np.abs((other - mean) / std).max() < chance
 
 
 def moments(found):

@@ -112,11 +112,11 @@ def test_gains_that_the_data_speak_against_are_forgotten(onto_clay):
     for seed in (6, 7):  # the simulator draws other gains for each recording: the sensors were all exchanged
         _, of_other_sensors = drive("loam", "dry_sand", seed)
         fit, alone = first_fit(of_other_sensors, gaussian, 600.0), first_fit(of_other_sensors, None)
-        assert np.array_equal(fit.gaussian.soil, alone.gaussian.soil)
-        assert np.array_equal(fit.gaussian.covariance, alone.gaussian.covariance)
+        assert np.array_equal(fit.mode.soil, alone.mode.soil)
+        assert np.array_equal(fit.mode.covariance, alone.mode.covariance)
 
 
 def test_after_years_nothing_is_left(onto_clay):
     gaussian, after = onto_clay
     fit, alone = first_fit(after, gaussian, 1e9), first_fit(after, None)
-    assert fit.gaussian.soil == pytest.approx(alone.gaussian.soil, rel=1e-6)
+    assert fit.mode.soil == pytest.approx(alone.mode.soil, rel=1e-6)

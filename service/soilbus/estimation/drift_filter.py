@@ -83,11 +83,9 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
             return objective.shifted(at_optimum, -step, drift_covariance)
         return objective.shifted(gaussian, constant.step - step, drift_covariance)
 
-    mode = shifted(fit.mode)
     return replace(
         fit,
-        mode=mode,
-        gaussian=mode if fit.gaussian is fit.mode else shifted(fit.gaussian),
+        mode=shifted(fit.mode),
         second_mode=None
         if fit.second_mode is None
         else fit.second_mode._replace(gaussian=shifted(fit.second_mode.gaussian)),

@@ -106,9 +106,8 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         With `marginalised`, and with the denoised window's Gaussians unless there is a second mode; `found` itself
         where there is nothing to average.
     """
-    spread = math.sqrt(max(found.mode.covariance[_N, _N], found.gaussian.covariance[_N, _N]))
     options = problem.options.posterior
-    is_determined = spread < options.determined_n_sd and found.second_mode is None
+    is_determined = math.sqrt(found.mode.covariance[_N, _N]) < options.determined_n_sd and found.second_mode is None
     if is_determined and load_signal(problem, found) > options.min_load_signal:
         return found
     with np.errstate(all="ignore"):
@@ -117,23 +116,22 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
             return found
         coordinates = coordinates_of(problem, prior)
         attainable = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
-        averaged = along.top.gaussian
+        averaged = along.top.mode
         if attainable is not None:
             averaged = _averaged(along.nodes, attainable, coordinates, joint_prior, options)
     is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
-    top = along.top.gaussian
-    is_gaussian = _agree(top, averaged, options)
-    return replace(found, gaussian=top, mode=along.top.mode, marginalised=averaged, is_gaussian=is_gaussian)
+    is_gaussian = _agree(along.top.mode, averaged, options)
+    return replace(found, mode=along.top.mode, marginalised=averaged, is_gaussian=is_gaussian)
 
 
-def _agree(gaussian: Gaussian, averaged: Gaussian, options: PosteriorOptions) -> bool:
+def _agree(mode: Gaussian, averaged: Gaussian, options: PosteriorOptions) -> bool:
     """Whether the average along n is near to the Gaussian at the mode and hardly wider."""
-    free = np.flatnonzero(np.diag(gaussian.covariance) > 0.0)
-    own, wide = (b.covariance[np.ix_(free, free)] for b in (gaussian, averaged))
+    free = np.flatnonzero(np.diag(mode.covariance) > 0.0)
+    own, wide = (b.covariance[np.ix_(free, free)] for b in (mode, averaged))
     widening = np.linalg.eigvals(np.linalg.solve(own, wide)).real
-    shift = gaussian.posterior.distance(averaged.posterior.soil)
+    shift = mode.posterior.distance(averaged.posterior.soil)
     return bool(shift < options.gaussian_shift_sd and widening.max() < options.gaussian_widening**2)
 
 
@@ -324,7 +322,7 @@ def _averaged(
     """
     free = coordinates.free
     active = _SOIL + np.flatnonzero(np.diag(joint_prior.covariance)[_SOIL:] > 0.0)
-    gaussians = [node.fit.gaussian for node in nodes]
+    gaussians = [node.fit.mode for node in nodes]
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], 400)
     by_density = density(u, np.array([node.neg2_log_density for node in nodes]), fine)

@@ -23,9 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.model_form import FormPosterior
-from soilbus.estimation.moments import gaussians_at
 from soilbus.estimation.observation_model import (
     CurvedPathFit,
     DenoisedObservationModel,
@@ -91,8 +90,6 @@ class Fit:
 
     Attributes
     ----------
-    gaussian
-        Soil and gains by their moments along k_c's share and c; as `mode` where these do not apply.
     mode
         Soil and gains at the minimum, with the inverse of the information as covariance.
     sinkage : (W,)
@@ -123,7 +120,6 @@ class Fit:
         Whether one mode describes the posterior; only then can it be the prior of later windows.
     """
 
-    gaussian: Gaussian
     mode: Gaussian
     sinkage: Array
     optimum: Optimum
@@ -141,19 +137,17 @@ class Fit:
 
     @property
     def posterior(self) -> Posterior:
-        """The marginal of the soil in `gaussian`."""
-        return self.gaussian.posterior
+        """The marginal of the soil in what is reported."""
+        return self.reported.posterior
 
     @property
     def reported(self) -> Gaussian:
-        """Soil and gains to be reported: `marginalised`, else the mixture with the second mode, else `gaussian`."""
+        """Soil and gains to be reported: `marginalised`, else the mixture of both modes, else `mode`."""
         if self.marginalised is not None:
             return self.marginalised
-        return (
-            self.gaussian
-            if self.second_mode is None
-            else self.gaussian.mixture(self.second_mode.gaussian, self.second_mode.share)
-        )
+        if self.second_mode is None:
+            return self.mode
+        return self.mode.mixture(self.second_mode.gaussian, self.second_mode.share)
 
     @property
     def converged(self) -> bool:
@@ -163,7 +157,7 @@ class Fit:
     @property
     def gains(self) -> Array:
         """Relative errors of the sensors (G,), by problem.gain_names."""
-        return self.gaussian.gains
+        return self.mode.gains
 
     @property
     def chi2(self) -> float:
@@ -338,7 +332,6 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
         return fit
     return replace(
         fit,
-        gaussian=found.gaussian,
         mode=found.mode,
         sinkage=found.sinkage,
         optimum=Optimum(objective.problem.t, iterate.soil, iterate.gains, iterate.latents, model.linearisation),
@@ -418,8 +411,7 @@ def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: S
 
     The candidate is an end of the search other than the first, from which `found` was reached, or the soil
     with k_c's other share.  There is no second mode where its share of the probability is below `min_mode_share`
-    or the two are less than `distinct_sd` apart.  Both then are by mode and curvature: the moments along
-    k_c's share would count the other mode twice.
+    or the two are less than `distinct_sd` apart.
     """
     options = objective.options
     has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
@@ -434,7 +426,7 @@ def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: S
     is_distinct = better.mode.posterior.distance(worse.mode.posterior.soil) >= options.distinct_sd
     if share < options.min_mode_share or not is_distinct:
         return better
-    return replace(better, gaussian=better.mode, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
+    return replace(better, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
 
 
 def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:
@@ -471,14 +463,15 @@ def _cold_fit(objective: Objective, near: Solution) -> Fit | None:
 
 def fit_at(objective: Objective, end: Solution, evaluations: int = 0) -> Fit | None:
     """The fit at the end of a descent, after evaluations of the model before it; None where it is not finite."""
-    gaussians = None if end.model is None else gaussians_at(objective, end.iterate, end.model, end.previous.soil)
-    if end.model is None or gaussians is None:
+    if end.model is None:
+        return None
+    inverse = solve_with_inverse(end.model.information, end.model.gradient)
+    if inverse is None:
         return None
     is_converged, previous = end.termination.is_converged, end.previous
     last_decrease = end.predicted_decrease if is_converged else 0.0
     return Fit(
-        gaussian=gaussians[0] if is_converged else gaussians[1],
-        mode=gaussians[1],
+        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1], previous.soil),
         sinkage=objective.problem.mean_sinkage(end.iterate.as_soil(), end.iterate.gains, end.iterate.latents),
         optimum=Optimum(objective.problem.t, previous.soil, previous.gains, previous.latents, end.model.linearisation),
         neg2_log_posterior=end.model.neg2_log_posterior - last_decrease,

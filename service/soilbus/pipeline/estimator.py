@@ -378,7 +378,7 @@ class WindowEstimator:
         """Whether a second mode has a bearing pressure or tan phi more than AMBIGUITY_SD from the first."""
         if fit.second_mode is None:
             return False
-        one, other = fit.posterior, fit.second_mode.gaussian.posterior
+        one, other = fit.mode.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUITY_SD * a.std for a, b in pairs)
 

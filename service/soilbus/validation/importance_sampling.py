@@ -31,8 +31,6 @@ PROPOSAL_DOF = 5.0
 """Degrees of freedom of the Student's t that the draws follow at a given n."""
 COVARIANCE_RATIO = 1.2
 """Covariance of the draws over that of the fit at the same n."""
-MIN_EIGENVALUE = 1e-9
-"""Least eigenvalue of a correlation matrix that is not singular."""
 PROPOSAL_DENSITY_POWER = 0.5
 """Power of the density of n that n is drawn from."""
 _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
@@ -142,18 +140,11 @@ def _draws(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
 
 
 def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Centre (O,) and lower root (O, O) of the covariance to draw the other coordinates from.
-
-    By the fit's moments, or by its curvature where they leave k_c's share no deviation.
-    """
-    free = coordinates.free
-    for gaussian in (node.fit.gaussian, node.fit.mode):
-        back = np.linalg.inv(coordinates.log_directions(gaussian.soil)[free])
-        covariance = (back @ gaussian.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
-        std = np.sqrt(covariance.diagonal())
-        if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > MIN_EIGENVALUE:
-            break
-    return coordinates.position(gaussian.soil)[others], np.asarray(np.linalg.cholesky(COVARIANCE_RATIO * covariance))
+    """Centre (O,) and lower root (O, O) of the covariance to draw the other coordinates from."""
+    free, mode = coordinates.free, node.fit.mode
+    back = np.linalg.inv(coordinates.log_directions(mode.soil)[free])
+    covariance = (back @ mode.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
+    return coordinates.position(mode.soil)[others], np.asarray(np.linalg.cholesky(COVARIANCE_RATIO * covariance))
 
 
 def _soil_at(position: Array, coordinates: Coordinates) -> Array:

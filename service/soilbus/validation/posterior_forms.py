@@ -2,8 +2,7 @@
 
     mode        optimum and inverse of the information                   (`Fit.mode`)
     denoised    the same, of the window without the noise of loads       (`Fit.mode` after `with_nested_laplace`)
-    moments     moments along k_c's share and c, or two modes' mixture   (`Fit.reported` before it)
-    laplace     averaged along n where n is not determined               (`Fit.reported` after it)
+    laplace     averaged along n where n is not determined               (`Fit.reported`)
 
 All are of the same windows: drives with an independent prior each, as in `monte_carlo`, or at constant slip and loads.
 Of each quantity's logarithm (of tan phi itself) the table has the share of 95 % intervals that hold the truth [%], the
@@ -35,7 +34,7 @@ from soilbus.terra.soils import soil_named
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE, SOILS, prior_about, problem_of, tasks_of
 
-FORMS = ("mode", "denoised", "moments", "laplace")
+FORMS = ("mode", "denoised", "laplace")
 QUANTITIES = ("pressure", "tan phi", "n", "K_L", "k_c")
 DRIVES = {"2 s": (2.0, True), "10 s": (10.0, True), "10 s constant": (10.0, False)}
 """Length of the window [s] and whether slip and loads vary, by name."""
@@ -45,7 +44,7 @@ CONSTANT_SLIP, NO_SHIFT = Swing(0.15, 0.15 + 1e-6), Swing(0.0, 1e-9)
 class Figures(NamedTuple):
     """Of one window: errors in reported sd (forms, quantities), in bounds (the same), processor time [s].
 
-    `seconds` is that of the fit by mode and moments, `laplace_seconds` that of what is done after it.
+    `seconds` is that of the fit, `laplace_seconds` that of what is done after it.
     """
 
     in_sd: Array
@@ -97,7 +96,7 @@ def figures_of(config: Config, soil_name: str, varied: bool, sinkage: bool, seed
     ended, width = time.thread_time(), float(rig.width.mean())
     bound = cramer_rao(noiseless, prior, soil)
     truth, least = values_and_sd(bound, config, width)
-    gaussians = (fit.mode, whole.mode, fit.reported, whole.reported)
+    gaussians = (fit.mode, whole.mode, whole.reported)
     found = [values_and_sd(gaussian.posterior, config, width) for gaussian in gaussians]
     off = np.array([value - truth for value, _ in found])
     return Figures(off / np.array([sd for _, sd in found]), off / least, between - began, ended - between)

@@ -87,7 +87,7 @@ def records_of(config: Config, points: Path, other_wheel: FittedModel | None = N
     records = recordings_of_tables(config, [points]).records
     if other_wheel is None:
         return records
-    return tuple(r.with_effects(other_wheel.effects, other_wheel.free, other_wheel.fits[-1].gaussian) for r in records)
+    return tuple(r.with_effects(other_wheel.effects, other_wheel.free, other_wheel.fits[-1].mode) for r in records)
 
 
 class Beside(NamedTuple):
@@ -122,7 +122,7 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path) -> dict[str, Beside]
 
 def strain(fitted: FittedModel) -> float:
     """Distance of the soil's posterior mean from its prior mean, as chi-square per parameter."""
-    before, after = fitted.joint_prior[-1], fitted.fits[-1].gaussian
+    before, after = fitted.joint_prior[-1], fitted.fits[-1].mode
     free = np.flatnonzero(np.diag(before.covariance)[:6] > 0.0)
     off = np.log(after.soil[free] / before.soil[free])
     return float(off @ np.linalg.solve(before.covariance[np.ix_(free, free)], off)) / len(free)

@@ -156,7 +156,7 @@ def of_soft_ground(tracked: TrackerOutput) -> TrackerOutput:
     fit = fit_of(tracked)
     gaussian = dataclasses.replace(fit.reported, soil=soft)
     return dataclasses.replace(
-        tracked, fit=dataclasses.replace(fit, gaussian=gaussian, marginalised=None, second_mode=None)
+        tracked, fit=dataclasses.replace(fit, mode=gaussian, marginalised=None, second_mode=None)
     )
 
 
