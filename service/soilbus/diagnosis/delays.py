@@ -147,7 +147,7 @@ def _posterior(
     options, low, high = records[0].options, first.parameter.low, first.parameter.high
     most = min(second.parameter.high, max(sum(here) - low, options.delay_step) + 2.0 * options.delay_step)
     bounds, start = (low, high), (sum(here), here[1])
-    nodes = options.delay_nodes
+    nodes = 11  # over the whole range, and again over where the posterior is
     ridge = _ridge(cost, np.linspace(0.0, most, nodes), start, bounds, first.std, options)
     near = np.flatnonzero(softmax(-0.5 * ridge.cost) > 1e-3)
     begin, end = ridge.tau[max(near[0] - 1, 0)], ridge.tau[min(near[-1] + 1, nodes - 1)]
@@ -155,8 +155,8 @@ def _posterior(
     start = float(ridge.total[top]), float(ridge.tau[top])
     ridge = _ridge(cost, np.linspace(begin, end, nodes), start, bounds, first.std, options)
     best = int(np.argmin(ridge.cost))
-    span = options.delay_span_sd * np.median(ridge.sd)
-    total = ridge.total[:, None] + span * np.linspace(-1.0, 1.0, options.delay_sums)
+    span = 4.0 * np.median(ridge.sd)
+    total = ridge.total[:, None] + span * np.linspace(-1.0, 1.0, 17)
     tau = np.broadcast_to(ridge.tau[:, None], total.shape)
     delay = total - tau
     within = (low <= delay) & (delay <= high)
@@ -219,7 +219,7 @@ def _best_sum(
     """The best sum at a time constant, its sd (at most the prior's std), and the cost there, by Newton's method."""
     step = options.delay_step
     low, high = bounds[0] + step, bounds[1] - step
-    for _ in range(options.delay_newton_steps):
+    for _ in range(12):
         total = min(max(total, low), high)
         earlier, here, later = (cost(s - tau, tau) for s in (total - step, total, total + step))
         curvature, slope = (earlier + later - 2.0 * here) / step**2, (later - earlier) / (2.0 * step)

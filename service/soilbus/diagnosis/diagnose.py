@@ -182,7 +182,7 @@ def rivals_of(
         return ()
     least = min(contested, key=lambda addition: addition.probability)
     others = [effect for effect in present.effects if effect.name != least.effect.name]
-    likeliest = sorted(least.alternatives, key=lambda name: -least.alternatives[name])[: full.options.max_rivals]
+    likeliest = sorted(least.alternatives, key=lambda name: -least.alternatives[name])[:2]
     fits = [full.fit((*others, by_name[name])) for name in likeliest if name not in present.names]
     return (present, *(fit for fit in fits if fit is not None))
 

@@ -331,18 +331,16 @@ def check(
 ) -> HeldOutCheck:
     """Held-out blocks under a model fitted to the others.
 
-    near: their latents under a model much like it, from which fewer linearisations are needed.  Evidence and chi2 are
+    near: their latents under a model much like it.  Evidence and chi2 are
     infinite where the model is not finite.
     """
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
     objective = Objective(problem, prior, fit.mode)
-    is_near = near is not None and len(near.load) == problem.n
-    rounds = options.check_rounds_near if is_near else options.check_rounds
     with np.errstate(all="ignore"):
         latents = objective.start_near(fit.mode.soil, gains, near).latents
         latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
-        for _ in range(rounds - 1):
+        for _ in range(options.check_rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
         quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents), at)
@@ -381,7 +379,7 @@ def _fits(
     first = joint_priors[0]
     if len(records) > 1 and records[0].joint_prior is None:
         descent = replace(options, give_up_above=np.inf)
-        joint_priors, fits = _swept(problems, prior, first, own, joint_priors, fits, descent, records[0].options)
+        joint_priors, fits = _swept(problems, prior, first, own, joint_priors, fits, descent)
     return first, joint_priors, fits
 
 
@@ -433,7 +431,6 @@ def _swept(
     joint_priors: list[Gaussian],
     fits: list[Fit],
     descent: SolverOptions,
-    options: DiagnosisOptions,
 ) -> tuple[list[Gaussian], list[Fit]]:
     """Joint priors and fits at the optimum of all recordings together.
 
@@ -446,7 +443,7 @@ def _swept(
     priors, fits = list(joint_priors), list(fits)
     factors = [_natural(f.mode, shared).without(_natural(p, shared)) for f, p in zip(fits, priors, strict=True)]
     before = _natural(first, shared)
-    for _ in range(options.max_sweeps):
+    for _ in range(6):
         moved = 0.0
         for i, problem in enumerate(problems):
             others = before
@@ -460,7 +457,7 @@ def _swept(
             moved = max(moved, float(np.max(np.abs(fit.mode.gains - fits[i].mode.gains)[shared] / sd)))
             priors[i], fits[i] = cavity, fit
             factors[i] = _natural(fit.mode, shared).without(others)
-        if moved < options.sweep_tolerance:
+        if moved < 0.1:  # posterior sd
             break
     else:
         fits = [replace(fit, termination=Termination.LIMIT) for fit in fits]

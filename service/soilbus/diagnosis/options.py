@@ -24,8 +24,6 @@ class DiagnosisOptions:
     """Folds that the blocks belong to by turns; the last is held out."""
     min_instants: int = 12
     """Instants that each part of a recording must have; no evidence recorded."""
-    min_rows: int = 5
-    """Rows that a table must have; no evidence recorded."""
     max_cross_validated: float = 1.5
     """Reduced chi-square [1] of one fold beyond which its noise does not matter, and no other fold is held out."""
 
@@ -36,8 +34,6 @@ class DiagnosisOptions:
     the hidden one is among the first three of 77, and of the others behind the thirteenth."""
     thinning: int = 4
     """The first fit of a candidate has one instant in this many; no evidence recorded."""
-    trial: SolverOptions = field(default_factory=lambda: SolverOptions(step_tolerance=0.1))
-    """Descent of that fit: looser, as it is only a start."""
     compared: SolverOptions = field(default_factory=lambda: SolverOptions(step_tolerance=2e-2))
     """Descent of fits that are compared by their objective: 0.02 of -2 log decides nothing."""
     negligible_fall: float = 1.0
@@ -45,14 +41,7 @@ class DiagnosisOptions:
     max_start_sd: float = 2.0
     """How far a start's parameters may be from neutral [prior sd], as the model is linear near the fit only."""
     check_rounds: int = 3
-    """Linearisations that bring the latents of held-out blocks from the measurements to their optimum; no evidence
-    recorded."""
-    check_rounds_near: int = 2
-    """The same from latents under a model much like it; no evidence recorded."""
-    max_sweeps: int = 6
-    """Rounds in which each of several recordings is fitted again beside all others; no evidence recorded."""
-    sweep_tolerance: float = 0.1
-    """Change of the shared values [posterior sd] from which a further round follows; no evidence recorded."""
+    """Linearisations that bring the latents of held-out blocks to their optimum; no evidence recorded."""
 
     max_excess: float = 10000.0
     """Excess [squared sd] from which on evidence counts no less: without it 4 of 24 blind pairs (seeds 301 to 303)
@@ -85,9 +74,6 @@ class DiagnosisOptions:
     max_overlap: float = 0.25
     """Share [1] by which the sum of what effects explain alone may differ from what they explain together: of 9 blind
     pairs (seed 132) with nothing in common it was 0.96 to 1.08, of 5 that look alike 1.1 to 1.6."""
-    max_rivals: int = 2
-    """Alternatives that are fitted beside the effect that was added, to find what would tell them apart; no evidence
-    recorded."""
 
     where_residuals: int = 20
     """Residuals that a region must have, and up to which nothing is selected as a residual term; no evidence
@@ -105,17 +91,8 @@ class DiagnosisOptions:
     """Share [1] of a channel's held-out excess chi-square that a description must explain to be reported; no evidence
     recorded."""
 
-    delay_nodes: int = 11
-    """Time constants of the delays' quadrature: over the whole range, and again over where the posterior is; no
-    evidence recorded."""
-    delay_sums: int = 17
-    """Sums of the quadrature at each time constant; no evidence recorded."""
-    delay_span_sd: float = 4.0
-    """How many sd to either side of the ridge they lie."""
     delay_step: float = 0.005
     """Half the span of sums [s] that a parabola goes through; no evidence recorded."""
-    delay_newton_steps: int = 12
-    """Steps along the sum at one time constant; no evidence recorded."""
     error_of_parts: float = 0.1
     """Further sd of a part of a delay, as a share of the sum [1]: what moves faster than a channel's interpolating
     curve is not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py).

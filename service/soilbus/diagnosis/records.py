@@ -145,7 +145,7 @@ def record_of_rows(
         Where the table has not enough usable rows.
     """
     problem = ObservationModelWithEffects(window, rig, model, min_speed=0.0)
-    if problem.n < options.min_rows:
+    if problem.n < 5:
         raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
     rank = np.argsort(np.argsort(problem.slip.mean(1), kind="stable"))
     held_out_rows = rank % options.folds == options.folds // 2

@@ -166,7 +166,7 @@ class Search:
         limit, margin = math.inf, dominated_deficit(self.temperature, self.options)
         for of_one in self._by_score(model)[: self.options.max_candidates]:
             effects, starts = (*model.effects, of_one[0].effect), [score.starts for score in of_one]
-            trial = self.thinned.fit(effects, starts, replace(self.options.trial, give_up_above=limit))
+            trial = self.thinned.fit(effects, starts, replace(self.options.compared, give_up_above=limit))
             if trial is not None:
                 trials.append((trial, of_one))
                 limit = min(limit, trial.neg2_log_posterior + margin)

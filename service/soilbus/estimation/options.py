@@ -146,8 +146,9 @@ class PosteriorOptions:
     """Fall of -2 log posterior from which curvature at knots is accepted; noise alone makes about 9 in a window of
     10 s."""
     form_stride: int = 4
-    """One instant of this many gets derivatives by the form parameters, which are smooth in loads and slips: linear
-    interpolation between them changes no sd of the soil by more than 3 %."""
+    """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
+    mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in one
+    on a curve."""
 
 
 @dataclass(frozen=True, slots=True)
