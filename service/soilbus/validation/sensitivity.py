@@ -49,6 +49,7 @@ from soilbus.validation.curved_drives import curved
 from soilbus.validation.driven_windows import task_of, windows
 
 FACTORS = (0.7, 1.3)
+HEAD = "| option | value | unit | -30 % | +30 % |"
 SWEPT, STEADY = Swing(0.05, 0.40), Swing(0.15, 0.15 + 1e-6)
 SECONDS = 40.0
 """Of each recording that is diagnosed."""
@@ -310,18 +311,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="fields with this in their path, as estimator.search. (all)")
     parser.add_argument("--page", type=Path, help="write the tables into this Markdown page, in the place of its own")
     chosen = parser.parse_args(arguments)
+    if chosen.only and chosen.page is not None:
+        parser.error("--page needs the tables of all fields: leave out --only")
     lines: list[str] = []
     for name, options, run, change in TABLES:
         if not any(chosen.only in f"{name}.{'.'.join(field.path)}" for field in fields_of(options)):
             continue
         began = time.process_time()
-        lines += [
-            "",
-            f"## {name.capitalize()}",
-            "",
-            "| option | value | unit | -30 % | +30 % |",
-            "| - | - | - | - | - |",
-        ]
+        lines += ["", f"## {name.capitalize()}", "", HEAD, "| - | - | - | - | - |"]
         for line in rows(name, options, run, change, chosen.only):
             print(line, flush=True)
             lines.append(line)
