@@ -147,8 +147,8 @@ class PosteriorOptions:
     10 s."""
     form_stride: int = 4
     """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
-    mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in one
-    on a curve."""
+    mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
+    one on a curve."""
 
 
 @dataclass(frozen=True, slots=True)
