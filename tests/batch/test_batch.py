@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
 from soilbus.offline.batch import BatchError, jobs_of, run_batch
+from soilbus.offline.parts import Job, Outcome
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
 from soilbus.pipeline.pipeline import Pipeline
@@ -138,12 +140,14 @@ def test_a_stopped_batch_goes_on_to_the_same_bytes(client, jobs, done, tmp_path)
     out = tmp_path / "fleet"
     with pytest.raises(KeyboardInterrupt):
         run_batch(client, jobs, out, stop)
-    before = {path: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
+    before = list((out / "parts").glob("*.gz"))
     assert 0 < len(before) < 4
-    batch = run_batch(client, jobs, out)
+    run_batch(client, jobs, out)
     assert files(out) == files(done[1])
-    assert batch.resumed == len(before) - 1  # the damaged log is tried again
-    (out / "parts" / next(iter(before)).name).write_bytes(b"half a part")
+    batch = run_batch(client, jobs, out)
+    assert (batch.resumed, batch.failed_before) == (6, 3)
+    assert files(out) == files(done[1])
+    before[0].write_bytes(b"half a part")
     assert run_batch(client, jobs, out).windows == batch.windows
     assert files(out) == files(done[1])
 
@@ -156,9 +160,53 @@ def test_a_log_repaired_is_read_again(client, config, logs, moved, tmp_path):
     assert run_batch(client, own, tmp_path / "out").errors
     log.write_text(moved(40.0))
     batch = run_batch(client, own, tmp_path / "out")
-    assert batch.errors == []
+    assert (batch.failed_before, batch.errors) == (0, [])
     assert batch.windows == 5
     assert run_batch(client, own, tmp_path / "out").resumed == 1
+
+
+def test_a_fault_is_kept_until_its_file_changes_or_on_request(client, config, logs, tmp_path):
+    for name in ("cut.log", "garbage.log", "other.log"):
+        shutil.copy(logs / "blue" / name, tmp_path)
+    garbage = (str(tmp_path / "garbage.log"), "memory://faults/garbage.log")
+    with fsspec.open(garbage[1], "wb") as file:
+        file.write(b"no log at all\n")
+    own, out = jobs_of(config, "t", [str(tmp_path / "*.log"), garbage[1]], no_other), tmp_path / "out"
+    assert run_batch(client, own, out).resumed == 0
+    errors = (out / "errors.parquet").read_bytes()
+    again = run_batch(client, own, out)
+    assert (again.resumed, again.failed_before) == (4, 4)
+    assert (out / "errors.parquet").read_bytes() == errors
+    assert run_batch(client, own, out, retry=True).resumed == 0
+    assert (out / "errors.parquet").read_bytes() == errors
+    for each in garbage:
+        with fsspec.open(each, "ab") as file:
+            file.write(b"no log, and longer than before\n")
+    assert run_batch(client, own, out).resumed == 2
+
+
+def test_what_is_no_fault_of_the_log_is_tried_again(client, config, logs, moved, tmp_path, monkeypatch):
+    whole, missing = tmp_path / "a/whole.log", tmp_path / "a/missing.log"
+    whole.parent.mkdir()
+    whole.write_text(moved(0.0))
+    own, out = jobs_of(config, "t", [str(whole), str(missing)], no_other), tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("soilbus.offline.batch.part_of", die)
+        faults = [row["fault"] for row in run_batch(client, own, out).errors]
+    assert all("its worker died each time" in fault for fault in faults)
+    batch = run_batch(client, own, out)
+    assert (batch.resumed, batch.windows) == (0, 5)
+    assert [row["fault"] for row in batch.errors] == [f"{missing}: no such file"]
+    missing.write_text(moved(20.0))
+    assert run_batch(client, own, out).windows == 10
+
+
+class KilledWorker(Exception):
+    """By the name of Dask's."""
+
+
+def die(job: Job, version: str) -> Outcome:
+    raise KilledWorker(job.log)
 
 
 def test_a_manifest_names_vehicle_start_and_configuration(client, config, logs, drive, tmp_path):
@@ -193,8 +241,6 @@ def test_logs_come_by_glob_url_and_parquet_manifest(config, logs, tmp_path):
 
 
 def test_a_url_and_a_log_sent_along_give_the_windows_of_a_path(client, config, logs, tmp_path, monkeypatch):
-    import fsspec
-
     content = (logs / "blue/whole.log").read_bytes()
     with fsspec.open("memory://fleet/whole.log", "wb") as file:
         file.write(content)
@@ -247,6 +293,30 @@ def test_workers_of_another_version_are_one_line(client, tractor, logs, tmp_path
     arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address]
     assert main(["batch", "--config", tractor, str(logs), *arguments]) == 1
     assert f"workers have soilbus 0.0.9, this is {soilbus.__version__}" in capsys.readouterr().err
+
+
+def test_other_versions_of_dask_are_one_line(client, tractor, logs, tmp_path, capsys, monkeypatch):
+    versions = client.get_versions()
+    versions["scheduler"]["packages"] = versions["client"]["packages"] | {"dask": "1.0"}
+    monkeypatch.setattr("distributed.Client.get_versions", lambda *_: versions)
+    arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address, "--set", SHORT]
+    assert main(["batch", "--config", tractor, str(logs / "blue/garbage.log"), *arguments]) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if "other versions" in line]
+    assert len(said) == 1
+    assert "of dask there than here" in said[0]
+
+
+@pytest.mark.parametrize(("missing", "line"), [("soilbus", "no soilbus"), ("soilbus.offline", "another soilbus")])
+def test_workers_without_this_soilbus_are_one_line(missing, line, client, tractor, logs, tmp_path, capsys, monkeypatch):
+    def run(*_: object) -> dict[str, str]:
+        raise RuntimeError(f"ModuleNotFoundError(\"No module named '{missing}'\")")  # as Dask says it
+
+    monkeypatch.setattr("distributed.Client.run", run)
+    arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address]
+    assert main(["batch", "--config", tractor, str(logs), *arguments]) == 1
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"its workers have {line}" in said
+    assert "install" in said
 
 
 def test_results_are_not_overwritten_by_accident(client, done, tractor, logs, capsys):

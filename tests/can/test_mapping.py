@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cantools.database.can import Database
 
 from field_data import field_config, needs_field
 from soilbus.can.admission import Admission
@@ -230,17 +231,17 @@ def test_shipped_files_are_found_by_name_and_checked(tmp_path: Path, monkeypatch
             shipped_dbc(name)
     work = tmp_path / "work"
     work.mkdir()
-    assert checked_messages(config(work, "ours.dbc")) == {"Ours"}
+    assert checked_messages(config(work, "ours.dbc"), Database()) == {"Ours"}
     (work / "ours.dbc").write_text(text, encoding="utf-8")  # the integrator's own file comes first
-    assert checked_messages(config(work, "ours.dbc")) == frozenset()
+    assert checked_messages(config(work, "ours.dbc"), Database()) == frozenset()
 
 
 def test_reference_tractor_of_the_checkout() -> None:
     c = parse_config({"dbc": {"input": ["tractor.dbc"]}})
     database = load_databases(c)
     assert shipped_dbc("tractor.dbc").parent.name == "dbc"
-    assert checked_messages(c) <= {m.name for m in database.messages}
-    assert checked_messages(c)
+    assert checked_messages(c, database) <= {m.name for m in database.messages}
+    assert checked_messages(c, database)
 
 
 @needs_field
@@ -250,7 +251,7 @@ def test_field_vehicle() -> None:
     found = channels_of(c, database)
     assert len(found) == 20
     assert without_unit(found, database) == []
-    assert checked_messages(c) == frozenset()
+    assert checked_messages(c, database) == frozenset()
     factors = {channel.name: channel.factor for channel in found}
     assert (factors["torque.FL"], factors["speed.FL"], factors["sinkage.RR"]) == (24.0, 1.0, 1e-3)
     assert len(Admission(found, database).can_filters()) == 10
@@ -328,7 +329,7 @@ def test_a_makers_own_message_can_be_required_to_carry_counter_and_checksum(tmp_
     for checked, admitted in (([], [1.0, 1.1, 1.2]), (["Wheel"], [1.0])):
         c = guarded(tmp_path, checked)
         database = load_databases(c)
-        admission = Admission(channels_of(c, database), database, checked_messages(c))
+        admission = Admission(channels_of(c, database), database, checked_messages(c, database))
         for t, data in frames:
             admission.feed(t, 256, False, data)
         assert admission.take().columns["load.W"].t.tolist() == admitted
@@ -336,8 +337,9 @@ def test_a_makers_own_message_can_be_required_to_carry_counter_and_checksum(tmp_
 
 
 def test_what_cannot_be_checked_is_a_fault(tmp_path: Path) -> None:
+    c = guarded(tmp_path, ["Wheel", "Motor", "Moto"])
     with pytest.raises(ConfigError) as error:
-        checked_messages(guarded(tmp_path, ["Wheel", "Motor", "Moto"]))
+        checked_messages(c, load_databases(c))
     assert error.value.faults == [
         "dbc.checked: no message Moto in the DBC; did you mean Motor?",
         "dbc.checked: Motor has no Counter and byte-aligned 8-bit Checksum",

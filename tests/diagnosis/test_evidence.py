@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-from soilbus.diagnosis.evidence import mixture_correction, mixture_neg2_log_evidence
+from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, mixture_neg2_log_evidence
 from soilbus.diagnosis.verdict import dominated_deficit, is_unexplained, probabilities, required_fall, temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -148,3 +148,24 @@ def test_a_great_gap_that_is_left_is_not_explained():
     assert not is_unexplained(1.6, 1.08, 3000)
     assert is_unexplained(1.6, 1.3, 3000)
     assert not is_unexplained(1.2, 1.03, 3000)
+
+
+def test_values_that_recordings_have_for_themselves_are_charged_but_those_of_one():
+    """Against the formula of one Gaussian parameter; a recording has the value or not, each with probability 1/2."""
+    divisor, falls = 5.0, {"a": 60.0, "b": 45.0}
+
+    def neg2_log_evidence(h: float, b: float) -> float:
+        return float(np.log1p(h) - b**2 / (1.0 + h))
+
+    def charge(h: float, b: float) -> float:
+        present = np.exp(-0.5 * neg2_log_evidence(h / divisor, b / divisor))
+        return float(-2.0 * np.log(0.5 + 0.5 * present) - neg2_log_evidence(h, b) / divisor)
+
+    readings = [(400.0, 0.0), (400.0, 60.0), (400.0, 150.0)]
+    own = [OwnParameters(np.array([[h]]), np.array([b]), (PLACE,)) for h, b in readings]
+    charges = sorted(charge(h, b) for h, b in readings)
+    charged = {"a": falls["a"] - divisor * sum(charges[:-1]), "b": falls["b"]}
+    wanted = probabilities(charged, divisor)
+    assert probabilities(falls, divisor, {"a": own}) == pytest.approx(wanted)
+    assert probabilities(falls, divisor, {"a": own[::-1]}) == pytest.approx(wanted)
+    assert probabilities(falls, divisor, {"a": own[:1]}) == probabilities(falls, divisor)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities
+from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities, onsets_of
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.assembly import prior_of, rig_of, with_effects
 from soilbus.offline.fleet import judged
@@ -90,3 +91,9 @@ def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():
     shares = {effect["name"]: (effect["vehicles_named"], effect["expected_share"]) for effect in fleet["effects"]}
     assert shares["slip_sinkage"] == (2, pytest.approx(2.45 / 3))
     assert fleet["vehicles_diagnosed"] == 3
+
+
+def test_what_describes_the_ground_of_a_log_has_no_onset():
+    records = [record(1, 7, "loam"), record(2, 7, "dry_sand")]
+    ground = SimpleNamespace(additions=[SimpleNamespace(effect=CATALOGUE[name]) for name in ("soil_drift", "grade")])
+    assert onsets_of(records, prior_of(CONFIG), ground) == {}

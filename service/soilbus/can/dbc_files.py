@@ -71,18 +71,18 @@ def _mapped(config: Config) -> set[str]:
     return found
 
 
-def checked_messages(config: Config) -> frozenset[str]:
+def checked_messages(config: Config, database: Database) -> frozenset[str]:
     """Names of the messages that must carry a right Counter and Checksum.
 
     Those are messages with both signals in DBC files that soilbus ships, and what
-    `dbc.checked` names; what another maker's Checksum means is not known.  Raises ConfigError
+    `dbc.checked` names in the database; what another maker's Checksum means is not known.  Raises ConfigError
     with a line for each name that is in no DBC or cannot be checked.
     """
     ours = [path for name in config.dbc.input if _is_shipped(path := located(config.folder, name))]
     found = {m.name for path in ours for m in _read(path).messages if checksum_byte_of(m) is not None}
     if not config.dbc.checked:
         return frozenset(found)
-    known = {m.name: m for m in load_databases(config, mapped_only=True).messages}
+    known = {m.name: m for m in database.messages}
     faults = [
         f"dbc.checked: no message {name} in the DBC{did_you_mean(name, known)}"
         for name in config.dbc.checked

@@ -224,6 +224,9 @@ def command_line() -> argparse.ArgumentParser:
     )
     sub.add_argument("--resume", action="store_true", help="go on with DIR: logs that are done are not read again")
     sub.add_argument(
+        "--retry", action="store_true", help="as --resume, but logs that failed or are damaged are read again"
+    )
+    sub.add_argument(
         "--diagnose", action="store_true", help="and say which vehicles have which fault, in DIR/diagnosis.json"
     )
 

@@ -365,12 +365,12 @@ def batch(args: argparse.Namespace) -> None:
     from soilbus.report.progress import phases
 
     check_folders(args.out)
-    if not args.resume:
+    if not (args.resume or args.retry):
         check_new(args.out)
     try:
         jobs = jobs_of(config, Path(args.config).name, args.logs, lambda path: load_config(path, args.set))
         with phases("batch") as progress, cluster(args.scheduler, say) as client:
-            done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose)
+            done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose, args.retry)
     except BatchError as error:
         raise WorkError(str(error)) from None
     print(batch_text(done, args.out), end="")

@@ -79,10 +79,19 @@ class OwnParameters(NamedTuple):
         The penalty for having the parameters does not shrink in that proportion, but as their information does
         (coarsened posterior: Miller & Dunson 2019, J. Am. Stat. Assoc. 114:1113).
         """
-        coarse = mixture_neg2_log_evidence(
+        return self._coarsened(temperature) - self._coarsened(1.0) / temperature
+
+    def surcharge_or_absent(self, temperature: float) -> float:
+        """The same where the recording has them or not, each with probability 1/2."""
+        coarsened = self._coarsened(temperature)
+        either = -2.0 * float(np.logaddexp(0.0, -0.5 * coarsened) - np.log(2.0))
+        return either - self._coarsened(1.0) / temperature
+
+    def _coarsened(self, temperature: float) -> float:
+        """-2 log evidence with a likelihood to the power of 1 / temperature."""
+        return mixture_neg2_log_evidence(
             self.information / temperature, self.information_vector / temperature, self.free
         )
-        return coarse - mixture_neg2_log_evidence(self.information, self.information_vector, self.free) / temperature
 
 
 def own_parameters(standardised: Array, covariance: Array, free: Sequence[Free]) -> OwnParameters:

@@ -223,16 +223,12 @@ class FittedModel:
         ]
 
     def own_parameters(self, effect: Effect) -> tuple[OwnParameters, ...]:
-        """Likelihood of each later recording's own values of an effect of the record.
-
-        Empty for other effects, even where they have a zero that wanders in each recording: without the wander they
-        are the same effect.
-        """
+        """Likelihood of each recording's own values of an effect; empty where the effect has none."""
         own = [i for i in _not_held(effect, self.free) if effect.own_in_each_record(self.free[i].parameter)]
-        if not own or not effect.of_record:
+        if not own:
             return ()
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
-        return tuple(own_parameters(*_moments(fit, n_sensors, own), free) for fit in self.fits[1:])
+        return tuple(own_parameters(*_moments(fit, n_sensors, own), free) for fit in self.fits)
 
     def shared_parameters(self, effect: Effect) -> OwnParameters:
         """Likelihood, by all recordings, of an effect's parameters that are the vehicle's; without held ones."""

@@ -37,6 +37,7 @@ __all__ = [
     "named",
     "onset_of",
     "onset_probabilities",
+    "onsets_of",
 ]
 
 FALSE_DISCOVERY_RATE = 0.05
@@ -134,7 +135,8 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
     first, found = 0, diagnose(records, prior, catalogue)
     onsets = onsets_of(records, prior, found)
     for _ in range(MAX_ROUNDS):
-        begin = next((onset.first for onset in onsets.values()), first)
+        surest = max(onsets.values(), key=lambda onset: max(onset.probabilities), default=None)
+        begin = first if surest is None else surest.first
         if begin == first:
             break
         # one value of the effect for all logs was wrong: it belongs to those from its onset on
@@ -179,9 +181,13 @@ def diagnose_type(
 
 
 def onsets_of(records: Sequence[Record], prior: SoilPrior, found: Diagnosis) -> dict[str, Onset]:
-    """The onset of each effect of a diagnosis, beside its others, by name; none of a single log."""
+    """The onset of each effect of the vehicle, beside the others of a diagnosis, by name; none of a single log."""
     effects = [addition.effect for addition in found.additions] if len(records) > 1 else []
-    return {e.name: onset_of(records, prior, e, [other for other in effects if other is not e]) for e in effects}
+    return {
+        e.name: onset_of(records, prior, e, [other for other in effects if other is not e])
+        for e in effects
+        if not e.of_record
+    }
 
 
 def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect, beside: Sequence[Effect] = ()) -> Onset:

@@ -132,8 +132,9 @@ def probabilities(
     divisor
         The temperature.
     own
-        By name, the parameters that each recording after the first has for itself: that their values agree is a
-        coincidence, which no error of a formula makes more likely.
+        By name, the parameters that each recording has for itself: that their values agree is a coincidence, which no
+        error of a formula makes more likely.  A recording may lack them.  The one that costs most is not charged, as
+        in a single recording nothing has to agree.
 
     Returns
     -------
@@ -141,7 +142,8 @@ def probabilities(
         Probabilities; what they lack to one is the probability that nothing more is missing.
     """
     tempered = [
-        fall / divisor - sum(one.surcharge(divisor) for one in own.get(name, ())) for name, fall in falls.items()
+        fall / divisor - sum(sorted(one.surcharge_or_absent(divisor) for one in own.get(name, ()))[:-1])
+        for name, fall in falls.items()
     ]
     chances = softmax(np.array([*tempered, TEMPERED_FALL_OF_NONE]) / 2.0).tolist()[:-1]
     return dict(sorted(zip(falls, chances, strict=True), key=lambda item: -item[1]))

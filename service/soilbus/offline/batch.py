@@ -3,8 +3,9 @@
     LOG...  ->  jobs  ->  parts/DIGEST.gz (one a log)  ->  windows, summaries, errors, map
 
 Only logs that have no part yet are replayed, so a run that was stopped, whatever stopped it, loses the logs in work
-and no more.  Workers need neither the configuration nor the DBC files nor the output folder: settings travel with a
-job, and parts come back.  Workers open a log by its path or URL; where they do not see the path, it is sent along.
+and no more.  What is wrong with a log is kept as well (parts/DIGEST.fault), until its file changes.  Workers need
+neither the configuration nor the DBC files nor the output folder: settings travel with a job, and parts come back.
+Workers open a log by its path or URL; where they do not see the path, it is sent along.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import json
 import logging
 import math
 import shutil
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib import import_module
 from importlib.util import find_spec
@@ -55,6 +57,8 @@ TASKS_PER_THREAD = 3
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
 """Of the processes started here.  Dask's own has MALLOC_TRIM_THRESHOLD_ = 64 KiB too: glibc then gives memory back to
 the kernel all the time and has it zeroed again."""
+COMPARED = ("python", "dask", "distributed", "numpy")
+"""Packages of which other versions may fail, or compute other last digits."""
 MAX_SENT_BYTES = 256 * 2**20
 """Bytes of a log that is sent along; it is in memory on its way."""
 
@@ -75,8 +79,8 @@ class Batch:
         Rows of errors.parquet.
     windows
         Windows of all logs.
-    resumed
-        Logs that were done before this run.
+    resumed, failed_before
+        Logs that were done before this run, and those of them whose fault was kept.
     fleet
         Content of diagnosis.json; None where it was not asked for.
     cpu_seconds, log_bytes, duration
@@ -87,6 +91,7 @@ class Batch:
     errors: list[dict[str, Any]]
     windows: int
     resumed: int
+    failed_before: int
     fleet: dict[str, Any] | None
     cpu_seconds: float
     log_bytes: int
@@ -215,10 +220,11 @@ def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
         files, name = url_to_fs(url)
         if glob.has_magic(name):
             return sorted(str(files.unstrip_protocol(each)) for each in files.glob(name))
-        if files.isdir(name):
+        # over HTTP a file that is asked whether it is a folder is read as a page of links
+        if not _is_log(name, suffixes) and files.isdir(name):
             found = [each for each in files.find(name) if _is_log(each, suffixes)]
             return sorted(str(files.unstrip_protocol(each)) for each in found)
-    except (ImportError, OSError, ValueError) as error:
+    except Exception as error:  # each protocol has its own
         raise BatchError(f"{url}: {one_line(error, 150)}") from None
     return [url]
 
@@ -270,11 +276,14 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
                 yield client
             return
         try:
-            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
+            with warnings.catch_warnings(category=distributed.versions.VersionMismatchWarning, action="ignore"):
+                client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
         except (OSError, TimeoutError, ValueError) as error:
             raise BatchError(f"{address}: no Dask scheduler there ({one_line(error, 100)})") from None
         with client:
             _check_workers(client, address)
+            if others := _other_versions(client):
+                say(f"{address}: other versions of {', '.join(others)} there than here: install the same everywhere")
             _announce(client, say)
             yield client
 
@@ -293,18 +302,24 @@ def worker_version() -> str:
 def _check_workers(client: Any, address: str) -> None:
     try:
         versions = set(client.run(worker_version).values())
-    except ModuleNotFoundError:
-        raise BatchError(f"{address}: its workers have no soilbus: install soilbus {__version__} there") from None
-    except Exception as error:  # of an older soilbus, in which this function is missing
-        raise BatchError(
-            f"{address}: its workers have another soilbus than {__version__} ({one_line(error, 100)})"
-        ) from None
+    except Exception as error:  # of Dask, which cannot find this function there
+        if "No module named 'soilbus'" in str(error):
+            raise BatchError(f"{address}: its workers have no soilbus: install soilbus {__version__} there") from None
+        what = f"its workers have another soilbus than {__version__}: install the same everywhere"
+        raise BatchError(f"{address}: {what} ({one_line(error, 100)})") from None
     if not versions:
         raise BatchError(f"{address}: the scheduler has no workers")
     if others := sorted(versions - {__version__}):
         raise BatchError(
             f"{address}: workers have soilbus {', '.join(others)}, this is {__version__}: install the same everywhere"
         )
+
+
+def _other_versions(client: Any) -> list[str]:
+    """Packages whose version differs between this process, the scheduler and its workers."""
+    found = client.get_versions()
+    here, there = found["client"]["packages"], [found["scheduler"], *found["workers"].values()]
+    return [name for name in COMPARED if any(each["packages"].get(name) != here.get(name) for each in there)]
 
 
 def done_in_turn(
@@ -359,6 +374,7 @@ def run_batch(
     out: Path,
     progress: Callable[[str], None] = lambda _: None,
     diagnose: bool = False,
+    retry: bool = False,
 ) -> Batch:
     """Replay all logs that are not done yet, then write the results of all.
 
@@ -374,6 +390,8 @@ def run_batch(
         Called with what is done.
     diagnose
         Whether to diagnose each vehicle over its logs, and the fleet.
+    retry
+        Whether to read logs that failed or were damaged again.
 
     Raises
     ------
@@ -385,9 +403,11 @@ def run_batch(
         A file cannot be written.
     """
     parts = out / "parts"
-    outcomes = _replay_all(client, jobs, parts, progress)
-    if jobs and all(outcome.other_bus for outcome in outcomes.values()) and len(outcomes) == len(jobs):
-        first = next(iter(outcomes.values())).fault
+    kept = {} if retry else _kept_faults(jobs, parts)
+    outcomes = _replay_all(client, jobs, parts, kept, progress)
+    of_logs: dict[str, KeptFault | Outcome] = {**kept, **outcomes}
+    if jobs and sum(each.other_bus for each in of_logs.values()) == len(jobs):
+        first = next(iter(of_logs.values())).fault
         names = ", ".join(sorted({job.setup.name for job in jobs}))
         raise ConfigError([f"{names}: fits no log: none of {len(jobs)} logs has a frame that its DBC knows ({first})"])
     summaries = {
@@ -397,7 +417,7 @@ def run_batch(
         {"vehicle": job.vehicle, "log": job.log, "windows": summary["windows.all"] if summary else 0, "fault": fault}
         for job in jobs
         for summary in [summaries.get(job.digest)]
-        if (fault := summary["fault"] if summary else outcomes[job.digest].fault)
+        if (fault := summary["fault"] if summary else of_logs[job.digest].fault)
     ]
     logs = dataset.log_rows(summaries.values())
     vehicles = dataset.vehicle_rows(logs, errors)
@@ -411,6 +431,7 @@ def run_batch(
         errors,
         sum(summary["windows.all"] for summary in summaries.values()),
         len(jobs) - len(outcomes),
+        len(kept),
         _diagnose_all(client, jobs, summaries, out, progress) if diagnose else None,
         math.fsum(outcome.cpu_seconds for outcome in outcomes.values()),
         sum(outcome.log_bytes for outcome in outcomes.values()),
@@ -422,19 +443,83 @@ def _part_path(parts: Path, digest: str) -> Path:
     return parts / f"{digest}.gz"
 
 
-def _replay_all(client: Any, jobs: Sequence[Job], parts: Path, progress: Callable[[str], None]) -> dict[str, Outcome]:
-    """Outcomes, by digest, of the logs that had no part, or one of a damaged log: it may be whole now."""
-    known = {job.digest: summary_of_part(_part_path(parts, job.digest)) for job in jobs}
-    left = {job.digest: job for job in jobs if (summary := known[job.digest]) is None or summary["fault"]}
+@dataclass(frozen=True, slots=True)
+class KeptFault:
+    """What is wrong with a log, as in an Outcome, and the state of its file: size in bytes, time of change [ns]."""
+
+    fault: str
+    windows: int
+    other_bus: bool
+    size: int
+    changed: int | None
+
+
+def _fault_path(parts: Path, digest: str) -> Path:
+    return parts / f"{digest}.fault"
+
+
+def _kept_faults(jobs: Sequence[Job], parts: Path) -> dict[str, KeptFault]:
+    """Faults by digest that were found before, in logs whose files are still the same."""
+    kept: dict[str, KeptFault] = {}
+    for job in jobs:
+        try:
+            fault = KeptFault(**json.loads(_fault_path(parts, job.digest).read_bytes()))
+        except (OSError, ValueError, TypeError):
+            continue
+        lost = fault.windows and summary_of_part(_part_path(parts, job.digest)) is None
+        if not lost and _state_of(job.log) in ((fault.size, fault.changed), (None, None)):
+            kept[job.digest] = fault
+    return kept
+
+
+def _state_of(log: str) -> tuple[int | None, int | None]:
+    """Size [bytes] of a log and, of a file, when it was changed [ns]; None where this machine cannot say."""
+    if "://" in log:
+        from fsspec.core import url_to_fs
+
+        try:
+            files, name = url_to_fs(log)
+            return files.size(name), None
+        except Exception:  # each protocol has its own
+            return None, None
+    try:
+        state = Path(log).stat()
+    except OSError:
+        return None, None
+    return state.st_size, state.st_mtime_ns
+
+
+def _is_whole(parts: Path, digest: str) -> bool:
+    """Whether there is the part of a log that was read to its end."""
+    summary = summary_of_part(_part_path(parts, digest))
+    return summary is not None and not summary["fault"]
+
+
+def _replay_all(
+    client: Any, jobs: Sequence[Job], parts: Path, kept: Mapping[str, KeptFault], progress: Callable[[str], None]
+) -> dict[str, Outcome]:
+    """Outcomes, by digest, of the logs that have no part and no kept fault, or the part of a damaged log."""
+    left = {job.digest: job for job in jobs if job.digest not in kept and not _is_whole(parts, job.digest)}
     outcomes: dict[str, Outcome] = {}
+    states: dict[str, tuple[int | None, int | None]] = {}
     unseen = _unseen_folders(client, left.values())
-    tasks = ((digest, (_carrying(job, unseen), __version__)) for digest, job in left.items())
+
+    def task(job: Job) -> tuple[Job, str]:
+        states[job.digest] = (None, None) if "://" in job.log else _state_of(job.log)
+        return _carrying(job, unseen), __version__
+
     failed = 0
-    for digest, result in done_in_turn(client, part_of, tasks):
+    for digest, result in done_in_turn(client, part_of, ((digest, task(job)) for digest, job in left.items())):
         outcome = _outcome(left[digest], result)
         outcomes[digest] = replace(outcome, part=None)
         if outcome.part is not None:
             dataset.put(_part_path(parts, digest), outcome.part)
+        _fault_path(parts, digest).unlink(missing_ok=True)
+        if outcome.lasting and outcome.fault is not None:
+            size, changed = states.pop(digest)
+            size = outcome.log_bytes if size is None else size
+            fault = KeptFault(outcome.fault, outcome.windows, outcome.other_bus, size, changed)
+            dataset.put(_fault_path(parts, digest), json.dumps(asdict(fault)).encode())
         failed += outcome.part is None
         done = len(jobs) - len(left) + len(outcomes)
         progress(f"{done} of {len(jobs)} logs" + (f", {failed} failed" if failed else ""))

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from io import BytesIO
+from io import SEEK_END, BytesIO
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
@@ -29,9 +29,9 @@ from typing import IO, Any
 from cantools.database.can import Database
 
 from soilbus import __version__
-from soilbus.can.dbc_files import load_databases
+from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.config.file import located
-from soilbus.config.model import Config
+from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
 from soilbus.offline.replay import LogError, OtherBus, replay
@@ -45,6 +45,7 @@ EARLIEST_DATE = 946684800.0
 """1 January 2000 [s]: smaller stamps count from the start of a log or of a logger, and are no dates."""
 LATEST_DATE = 4102444800.0
 """1 January 2100 [s]."""
+MISSING = "no such file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +112,8 @@ class Outcome:
         Windows of the part.
     other_bus
         Whether no frame of the log is in the DBC.
+    lasting
+        Whether the fault is of what is in the log, so that the same file has it again; else of the place or machine.
     cpu_seconds, log_bytes
         Cost: processor time, size of the log.
     """
@@ -119,6 +122,7 @@ class Outcome:
     fault: str | None
     windows: int = 0
     other_bus: bool = False
+    lasting: bool = False
     cpu_seconds: float = 0.0
     log_bytes: int = 0
 
@@ -141,15 +145,51 @@ def setup_of(config: Config, name: str) -> Setup:
     ConfigError
         A DBC file is missing or does not fit the configuration.
     """
-    database, texts = None, []
-    if config.table is None:
-        database = load_databases(config)
-        Pipeline(config, database)
-        texts = [located(config.folder, dbc).read_bytes() for dbc in config.dbc.input]
     digest = hashlib.sha256(config.model_dump_json().encode())
-    for text in texts:
-        digest.update(hashlib.sha256(text).digest())
+    database = None
+    if config.table is None:
+        with TemporaryDirectory(prefix="soilbus-") as folder:
+            here = _with_dbcs_here(config, Path(folder))
+            database = load_databases(here)
+            for dbc in here.dbc.input:
+                digest.update(hashlib.sha256(located(here.folder, dbc).read_bytes()).digest())
+            # a worker has none of these files: what it needs of them is the database, and the names of what is checked
+            config = _with_dbc(config, input=[], checked=sorted(checked_messages(here, database)))
+        Pipeline(config, database)
     return Setup(name, pickle.dumps((config, database)), digest.hexdigest())
+
+
+def _with_dbc(config: Config, **settings: list[str]) -> Config:
+    return config.model_copy(update={"dbc": config.dbc.model_copy(update=settings)})
+
+
+def _with_dbcs_here(config: Config, folder: Path) -> Config:
+    """The configuration with copies, in the folder, of the DBC files that it names by URL."""
+    paths = []
+    for n, name in enumerate(config.dbc.input):
+        paths.append(name)
+        if "://" in name:
+            try:
+                paths[-1] = str(_fetched(name, folder / str(n)))
+            except LogError as error:
+                raise ConfigError([f"dbc.input: {error}"]) from None
+    return _with_dbc(config, input=paths)
+
+
+def _fetched(url: str, folder: Path) -> Path:
+    """Copy of the file at a URL, in a folder that is made; LogError where there is none."""
+    from fsspec.core import url_to_fs
+
+    path = folder / url.rpartition("/")[2]
+    folder.mkdir(exist_ok=True)
+    try:
+        files, name = url_to_fs(url)
+        files.get_file(name, str(path))
+    except FileNotFoundError:
+        raise LogError(f"{url}: {MISSING}") from None
+    except Exception as error:  # each protocol has its own
+        raise LogError(f"{url}: cannot be fetched ({one_line(error, 150)})") from None
+    return path
 
 
 @lru_cache(maxsize=16)
@@ -174,38 +214,43 @@ def part_of(job: Job, version: str) -> Outcome:
         This soilbus is of another version.
     """
     check_version(version)
-    begin = time.thread_time()
+    begin, size = time.thread_time(), 0
     try:
         with local_log(job) as path:
-            size = path.stat().st_size if path.exists() else 0
+            with path.open("rb") as log:
+                size = log.seek(0, SEEK_END)
             outcome = _replayed(job, path)
     except LogError as error:
         return Outcome(None, str(error))
     except MemoryError:
         return Outcome(None, f"{job.log}: not enough memory")
+    except OSError as error:
+        return Outcome(None, f"{job.log}: {MISSING if isinstance(error, FileNotFoundError) else one_line(error, 200)}")
     except Exception as error:  # a defect of ours, or of a library on a file that it never met
-        return Outcome(None, f"{job.log}: {one_line(error, 200)} ({type(error).__name__})")
+        return Outcome(
+            None, f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True, log_bytes=size
+        )
     return replace(outcome, cpu_seconds=time.thread_time() - begin, log_bytes=size)
 
 
 @contextmanager
 def local_log(job: Job) -> Iterator[Path]:
-    """Path of the log on this machine; of a URL, and of a log sent along, as long as the context lasts."""
+    """Path of the log on this machine; of a URL, and of a log sent along, as long as the context lasts.
+
+    Raises
+    ------
+    LogError
+        The URL cannot be read.
+    """
     if job.content is None and "://" not in job.log:
         yield Path(job.log)
         return
     with TemporaryDirectory(prefix="soilbus-") as folder:
+        if job.content is None:
+            yield _fetched(job.log, Path(folder))
+            return
         path = Path(folder, job.log.rpartition("/")[2])
-        if job.content is not None:
-            path.write_bytes(job.content)
-        else:
-            from fsspec.core import url_to_fs
-
-            files, name = url_to_fs(job.log)
-            try:
-                files.get_file(name, str(path))
-            except FileNotFoundError:
-                raise LogError(f"{job.log}: no such file") from None
+        path.write_bytes(job.content)
         yield path
 
 
@@ -229,12 +274,15 @@ def _part_by_way_of(lines: IO[bytes], job: Job, config: Config, database: Databa
             fault = error
     text = None if fault is None else str(fault).replace(str(path), job.log)
     if fault is not None and not summary.windows:
-        return Outcome(None, text, other_bus=isinstance(fault, OtherBus))
+        return Outcome(None, text, other_bus=isinstance(fault, OtherBus), lasting=True)
     if not summary.windows:
-        return Outcome(None, f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window")
+        text = f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window"
+        return Outcome(None, text, lasting=True)
     head = json.dumps(summary.record(pipeline, text), allow_nan=False).encode() + b"\n"
     lines.seek(0)
-    return Outcome(b"".join((gzip.compress(head, mtime=0), lines.read())), text, summary.windows)
+    return Outcome(
+        b"".join((gzip.compress(head, mtime=0), lines.read())), text, summary.windows, lasting=fault is not None
+    )
 
 
 class _Summary:

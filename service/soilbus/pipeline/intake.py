@@ -218,7 +218,7 @@ class Intake:
     def __init__(self, config: Config, database: Database, delays: Mapping[str, float] | None = None) -> None:
         self._config, self._database, self._delays = config, database, delays
         self.channels = channels_of(config, database)
-        self.admission = Admission(self.channels, database, checked_messages(config))
+        self.admission = Admission(self.channels, database, checked_messages(config, database))
         self.rig = rig_of(config)
         self._binned = frozenset(self.rig.channels)
         self.refusals = Refusals()

@@ -23,7 +23,9 @@ def batch_text(batch: Batch, out: Path) -> str:
         text += f"and {len(batch.vehicles) - MAX_ROWS} more vehicles in {out / 'vehicles.parquet'}\n"
     logs, failed = sum(row["logs.all"] for row in batch.vehicles), sum(row["logs.failed"] for row in batch.vehicles)
     text += f"{logs - failed} of {logs} logs done, {batch.windows} windows"
-    text += f"; {batch.resumed} logs were done before\n" if batch.resumed else "\n"
+    text += f"; {batch.resumed - batch.failed_before} logs were done before" if batch.resumed else ""
+    text += f"; {batch.failed_before} with a fault were not read again (--retry does)" if batch.failed_before else ""
+    text += "\n"
     for error in batch.errors[:MAX_FAULTS]:
         kept = f" (the {error['windows']} windows before that are kept)" if error["windows"] else ""
         text += f"  {error['fault']}{kept}\n"

@@ -47,7 +47,7 @@ def configuration_report(config: Config) -> str:
     channels = channels_of(config, database)
     check_cycle_times(config, output_database(config))
     assumed = {c.name for c in without_unit(channels, database)}
-    checked = checked_messages(config)
+    checked = checked_messages(config, database)
     rows = [_row(channel, database, channel.name in assumed, channel.message in checked) for channel in channels]
     head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
     return _report(config, [table(head, rows)])

@@ -209,7 +209,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
         channels = channels_of(with_motors, database)
     except ConfigError:  # of a speed that nobody mapped
         with_motors, channels = config, channels_of(config, database)
-    admission = Admission(channels, database, checked_messages(config))
+    admission = Admission(channels, database, checked_messages(config, database))
     longest, refused, n = longest_part(admission, frames)
     seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
     if not sum(admission.counts.received.values()):

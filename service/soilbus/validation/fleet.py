@@ -55,7 +55,7 @@ FAULTS = (
 )
 """Faults of vehicles, between barely visible and as great as they get."""
 SHARED = (Fault("drivetrain_loss:constant", 60.0), Fault("drivetrain_loss:efficiency", 0.07))
-"""Effects of a type."""
+"""Effects of a type, unless another is asked for."""
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,20 @@ def is_true(one: Named, of: Fleet) -> bool:
     return one.vehicle in of.faults and one.effect == of.faults[one.vehicle].effect
 
 
-def fleet_of(seed: int, with_shared: bool) -> Fleet:
-    """Three vehicles with faults by turns, and an effect of the type or none."""
+def of_type(name: str) -> tuple[Fault, ...]:
+    """An effect of the catalogue as one of a type: in each of its forms, of medium size.  ValueError if it has none."""
+    forms = [form for form in FORMS if form.effect == name]
+    if not forms:
+        raise ValueError(f"no form of {name}; known: {', '.join(sorted({form.effect for form in FORMS}))}")
+    return tuple(Fault(form.title, form.size("medium", with_sinkage=True)) for form in forms)
+
+
+def fleet_of(seed: int, shared: Sequence[Fault]) -> Fleet:
+    """Three vehicles with faults by turns, and one of these effects of the type by turns; or none."""
     rng = np.random.default_rng([seed, 7])
     kinds = [FAULTS[i] for i in rng.choice(len(FAULTS), 3, replace=False)]
     who = rng.choice(VEHICLES, 3, replace=False).tolist()
-    return fleet(seed, dict(zip(who, kinds, strict=True)), SHARED[seed % len(SHARED)] if with_shared else None)
+    return fleet(seed, dict(zip(who, kinds, strict=True)), shared[seed % len(shared)] if shared else None)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,12 +156,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--seed", type=int, default=1, help="of the first fleet (1)")
     parser.add_argument("--fleets", type=int, default=2, help="fleets of each kind (2)")
+    parser.add_argument("--type-effect", metavar="NAME", help="of the type, in its forms by turns (drivetrain_loss)")
+    parser.add_argument("--only-shared", action="store_true", help="no fleets without an effect of the type")
     chosen = parser.parse_args(arguments)
+    try:
+        shared = of_type(chosen.type_effect) if chosen.type_effect else SHARED
+    except ValueError as error:
+        parser.error(str(error))
     rows = []
-    for with_shared in (True, False):
+    for effects in (shared,) if chosen.only_shared else (shared, ()):
         faults = found = since = types = types_found = sound = sound_named = true = given = 0
         for seed in range(chosen.seed, chosen.seed + chosen.fleets):
-            of = fleet_of(seed, with_shared)
+            of = fleet_of(seed, effects)
             names = names_given(of)
             right = [one for one in names if is_true(one, of)]
             print(f"seed {seed}, {of.shared and of.shared.form}, {dict(of.faults)}:", flush=True)
@@ -167,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sound_named += len({one.vehicle for one in names if one.vehicle is not None} - of.faults.keys())
             true, given = true + len(right), given + len(names)
         rows.append((
-            "shared effect" if with_shared else "none shared", f"{found} of {faults}", f"{since} of {found}",
+            "shared effect" if effects else "none shared", f"{found} of {faults}", f"{since} of {found}",
             f"{types_found} of {types}", f"{sound_named} of {sound}", f"{given - true} of {given}",
         ))  # fmt: skip
     head = ("fleets", "faults named", "onset right", "type effects named", "sound vehicles named", "false names")
