@@ -143,6 +143,16 @@ class Instrumentation:
         M[:W, :W], M[W : 2 * W, W : 2 * W] = ([row.weight for row in rows] for rows in (self.load, self.speed))
         return M
 
+    @property
+    def loads_by_torques(self) -> NDArray[np.bool_]:
+        """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
+        computed, wheels = self.computes("torque"), np.array([row.weight for row in self.load]) != 0.0
+        sums = [on for on, row in zip(wheels, self.load, strict=True) if row.kind == "channel"]
+        return np.array([
+            row.kind == "side" and not computed[on].any() and any(np.array_equal(on, of_sum) for of_sum in sums)
+            for on, row in zip(wheels, self.load, strict=True)
+        ])  # fmt: skip
+
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)

@@ -176,10 +176,13 @@ class Measurements:
         self._from_observed: Array | None = None
         self._mass_gain: int | None = None
         self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
+        self._by_torques = np.zeros_like(self._prior_only)
         if given is not None:
             self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
+            self._by_torques[: len(given.load)] = given.loads_by_torques
             self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
+            self._prior_only &= ~self._by_torques
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
     def observed(self, latents: Array) -> Array:
@@ -243,7 +246,7 @@ class Measurements:
 
     @property
     def computes_loads(self) -> bool:
-        """Whether a load is not measured."""
+        """Whether a load stays at its prior, which neither a load cell nor torques measure."""
         return bool(self._prior_only.any())
 
     @property

@@ -16,7 +16,9 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
     r <- r + A (x_measured / (1 + g_x) - x),    covariance  S = A V A' + R,    chi-square = sum r' S^-1 r.
 
 A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
-(`with_weights_at`), and its noise by draft and inertia is that of the balance.
+(`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
+two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
+pull are curved in the load, so that unequal loads held equal bias the soil.  Behind a differential no torque says so.
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
@@ -498,6 +500,17 @@ class ObservationModel(Measurements):
         if self.computes_loads:
             held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
         return held
+
+    def noise_of_fitted(self, optimum: Optimum) -> Array:
+        """Variance (N, 2 W + 1) of the noise in latents: V as measured; V - V A' S^-1 A V where torques say more."""
+        A, noise, fitted = optimum.at.by_latents, optimum.at.variance, self._by_torques
+        if not fitted.any():
+            return noise
+        by, prior = A[:, :, fitted], noise[:, fitted]
+        inverse = self.inverse_covariance(A, *self.variances(optimum.gains))
+        noise = noise.copy()
+        noise[:, fitted] = prior - prior**2 * (by * (inverse @ by)).sum(1)
+        return noise
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
         """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
@@ -1246,7 +1259,7 @@ class DenoisedObservationModel(ObservationModel):
         self.__dict__.update(vars(problem))
         self._base = problem
         layout, fitted = problem.layout, optimum.latents
-        self._shrunk = shrunk_latents(problem.observed(fitted.joined()), optimum.at.variance)
+        self._shrunk = shrunk_latents(problem.observed(fitted.joined()), problem.noise_of_fitted(optimum))
         latents = problem.from_observed(self._shrunk)
         load, speed, ground_speed = latents[:, layout.loads], latents[:, layout.speeds], latents[:, layout.ground_speed]
         soil = Soil(*optimum.soil.tolist())
