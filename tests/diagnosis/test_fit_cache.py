@@ -8,7 +8,7 @@ import pytest
 
 from soilbus.diagnosis import search as search_module
 from soilbus.diagnosis.search import FitCache
-from soilbus.estimation.solver import SolverOptions
+from soilbus.estimation.options import SolverOptions
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 PAN, LUGS = CATALOGUE["hardpan"], CATALOGUE["lugs"]

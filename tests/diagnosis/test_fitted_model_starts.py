@@ -13,7 +13,8 @@ from soilbus.diagnosis.score import scores
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_at
-from soilbus.estimation.solver import Objective, SolverOptions, minimise
+from soilbus.estimation.options import SolverOptions
+from soilbus.estimation.solver import Objective, minimise
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -14,7 +14,8 @@ from soilbus.estimation import multistart
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.solver import SolverOptions, minimise
+from soilbus.estimation.options import SolverOptions
+from soilbus.estimation.solver import minimise
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
 from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
+from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -197,17 +198,18 @@ def test_gains_are_named_in_the_order_of_their_columns(few):
 
 def test_acceleration_from_speed_and_its_variance():
     t = np.arange(0.0, 10.0, 0.1)
-    a, variance = differentiated_speed(t, 1.0 + 0.3 * t, np.full(100, 1e-4))
+    a, variance = differentiated_speed(t, 1.0 + 0.3 * t, np.full(100, 1e-4), MeasurementOptions())
     assert a == pytest.approx(np.full(100, 0.3), abs=1e-12)
     assert variance[50] == pytest.approx(1e-4 / (0.01 * 28), rel=1e-9)  # sum of squares of -3..3
     rng = np.random.default_rng(0)
     speed = 1.0 + 0.3 * np.sin(0.5 * t) + 0.01 * rng.standard_normal((400, 100))
-    miss = np.stack([differentiated_speed(t, row, np.full(100, 1e-4))[0] - 0.15 * np.cos(0.5 * t) for row in speed])
+    found = np.stack([differentiated_speed(t, row, np.full(100, 1e-4), MeasurementOptions())[0] for row in speed])
+    miss = found - 0.15 * np.cos(0.5 * t)
     assert miss[:, 10:90].std() == pytest.approx(np.sqrt(1e-4 / 0.28), rel=0.05)
     # A jerk is not a precise acceleration.
     step = np.where(t < 5.0, 1.0, 2.0)
-    assert differentiated_speed(t, step, np.full(100, 1e-4))[1][50] > 10.0 * variance[50]
-    assert (differentiated_speed(t[:2], step[:2], np.full(2, 1e-4))[1] >= 1.0).all()
+    assert differentiated_speed(t, step, np.full(100, 1e-4), MeasurementOptions())[1][50] > 10.0 * variance[50]
+    assert (differentiated_speed(t[:2], step[:2], np.full(2, 1e-4), MeasurementOptions())[1] >= 1.0).all()
 
 
 def test_rows_that_one_latent_swamps_have_a_finite_inverse():

@@ -40,7 +40,7 @@ def _names(tracker, window):
 
 def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
     monkeypatch.setattr("soilbus.estimation.tracker.with_curvature", lambda gaussian, curve: gaussian)
-    monkeypatch.setattr("soilbus.estimation.path_curvature.MIN_CURVATURE_GAIN", np.inf)
+    monkeypatch.setattr("soilbus.estimation.tracker.detected_curvature", lambda objective, fit: None)
     config = reference_configuration()
     scenario = Scenario(11.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     window, end = next(windows(config, simulate(config, scenario, 1)))
@@ -57,7 +57,7 @@ def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
         return np.array([w.away for w in output])
 
     assert np.abs(away()).max() < 3.0
-    monkeypatch.setattr("soilbus.estimation.path_curvature.MIN_CURVATURE_GAIN", np.inf)
+    monkeypatch.setattr("soilbus.estimation.tracker.detected_curvature", lambda objective, fit: None)
     assert np.abs(away()[:, 1]).max() > 3.0
 
 

@@ -17,9 +17,10 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Start, fit_from, fit_from_soil, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, SolverOptions, Termination, minimise
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Termination, minimise
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 
@@ -196,7 +197,7 @@ def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     problem, prior = bulldozed
     joint_prior = Gaussian.of(prior, problem.gain_std)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
-    fit = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains))
+    fit = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains), SolverOptions())
     assert fit.converged
     low, high = problem.gain_bounds()
     assert np.all(fit.mode.gains >= low - 1e-9)

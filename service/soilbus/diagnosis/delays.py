@@ -22,6 +22,7 @@ from scipy.special import softmax
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Fit, Start
@@ -35,23 +36,6 @@ Cost = Callable[[float, float], float]
 """-2 log posterior, tempered, of dead time [s] and time constant [s]."""
 
 _SOIL = len(PARAMETERS)
-# A value whose docstring states no source has no evidence recorded.
-NODES = 11
-"""Time constants of the quadrature: over the whole range, and again over where the posterior is."""
-SUM_STEP = 0.005
-"""Half the span of sums [s] that a parabola goes through."""
-SUMS, SPAN_SD = 17, 4.0
-"""Sums of the quadrature at each time constant, and how many sd to either side of the ridge they lie."""
-MAX_NEWTON_STEPS = 12
-"""Steps along the sum at one time constant."""
-ERROR_OF_PARTS, ERROR_OF_SUM = 0.1, 0.02
-"""Further sd of a part and of the sum, as shares of the sum: what moves faster than a channel's interpolating curve is
-not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py)."""
-SURE_SD = 5.0
-"""Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the pitch
-of a simulated drive is late that is not."""
-REFIT_FALL = 2.0
-"""Fall of the tempered -2 log posterior along a ridge from which the model is fitted again from there."""
 
 
 class DelayPosterior(NamedTuple):
@@ -70,7 +54,7 @@ class DelayPosterior(NamedTuple):
 def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float) -> FittedModel:
     """A fitted model that reports delays by their joint posteriors.
 
-    Fitted again from the best delays where these lower -2 log posterior by more than REFIT_FALL.
+    Fitted again from the best delays where these lower -2 log posterior by more than `delay_refit_fall`.
 
     Parameters
     ----------
@@ -82,7 +66,7 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
         The temperature.
     """
     found = delay_posteriors(records, prior, fitted, divisor)
-    if any(posterior.fall > REFIT_FALL * divisor for posterior in found.values()):
+    if any(posterior.fall > records[0].options.delay_refit_fall * divisor for posterior in found.values()):
         better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
         if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
             fitted, found = better, delay_posteriors(records, prior, better, divisor)
@@ -114,7 +98,7 @@ def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior
 def exceeds_sampling_delay(
     records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, divisor: float
 ) -> bool:
-    """Whether an effect of a fitted model delays any channel by more than half its sample time, by SURE_SD.
+    """Whether an effect of a fitted model delays any channel by more than half its sample time, by `delay_sure_sd`.
 
     A stamp says when a frame was on the bus: its value was measured up to a cycle before, half of one on average.
     True where no channel's sample time is known.
@@ -127,7 +111,8 @@ def exceeds_sampling_delay(
         for (name, late), posterior in delay_posteriors(records, prior, fitted, divisor).items()
         if name == effect.name
     ]
-    return any(abs(total.value) - SURE_SD * total.std > of_cycle for total, of_cycle in totals)
+    sure_sd = records[0].options.delay_sure_sd
+    return any(abs(total.value) - sure_sd * total.std > of_cycle for total, of_cycle in totals)
 
 
 def delay_posteriors(
@@ -159,17 +144,19 @@ def _posterior(
         of_prior = first.standardised(delay) ** 2 + second.standardised(tau) ** 2
         return of_prior + sum(profile.cost(delay, tau) for profile in profiles) / divisor
 
-    low, high = first.parameter.low, first.parameter.high
-    most = min(second.parameter.high, max(sum(here) - low, SUM_STEP) + 2.0 * SUM_STEP)
+    options, low, high = records[0].options, first.parameter.low, first.parameter.high
+    most = min(second.parameter.high, max(sum(here) - low, options.delay_step) + 2.0 * options.delay_step)
     bounds, start = (low, high), (sum(here), here[1])
-    ridge = _ridge(cost, np.linspace(0.0, most, NODES), start, bounds, first.std)
+    nodes = 11  # over the whole range, and again over where the posterior is
+    ridge = _ridge(cost, np.linspace(0.0, most, nodes), start, bounds, first.std, options)
     near = np.flatnonzero(softmax(-0.5 * ridge.cost) > 1e-3)
-    begin, end = ridge.tau[max(near[0] - 1, 0)], ridge.tau[min(near[-1] + 1, NODES - 1)]
+    begin, end = ridge.tau[max(near[0] - 1, 0)], ridge.tau[min(near[-1] + 1, nodes - 1)]
     top = int(np.argmin(ridge.cost))
     start = float(ridge.total[top]), float(ridge.tau[top])
-    ridge = _ridge(cost, np.linspace(begin, end, NODES), start, bounds, first.std)
+    ridge = _ridge(cost, np.linspace(begin, end, nodes), start, bounds, first.std, options)
     best = int(np.argmin(ridge.cost))
-    total = ridge.total[:, None] + SPAN_SD * np.median(ridge.sd) * np.linspace(-1.0, 1.0, SUMS)
+    span = 4.0 * np.median(ridge.sd)
+    total = ridge.total[:, None] + span * np.linspace(-1.0, 1.0, 17)
     tau = np.broadcast_to(ridge.tau[:, None], total.shape)
     delay = total - tau
     within = (low <= delay) & (delay <= high)
@@ -185,9 +172,9 @@ def _posterior(
         return Estimate(mean, float(np.sqrt(variance + cell**2 + (error * mean_total) ** 2)))
 
     return DelayPosterior(
-        estimate_of(delay, np.hypot(tau_cell, sum_cell), ERROR_OF_PARTS),
-        estimate_of(tau, tau_cell, ERROR_OF_PARTS),
-        estimate_of(total, sum_cell, ERROR_OF_SUM),
+        estimate_of(delay, np.hypot(tau_cell, sum_cell), options.error_of_parts),
+        estimate_of(tau, tau_cell, options.error_of_parts),
+        estimate_of(total, sum_cell, options.error_of_sum),
         (float(ridge.total[best] - ridge.tau[best]), float(ridge.tau[best])),
         divisor * (cost(*here) - float(ridge.cost[best])),
     )
@@ -202,7 +189,14 @@ class _Ridge(NamedTuple):
     cost: Array
 
 
-def _ridge(cost: Cost, taus: Array, here: tuple[float, float], bounds: tuple[float, float], std: float) -> _Ridge:
+def _ridge(
+    cost: Cost,
+    taus: Array,
+    here: tuple[float, float],
+    bounds: tuple[float, float],
+    std: float,
+    options: DiagnosisOptions,
+) -> _Ridge:
     """The least cost at each time constant, over sums that leave the delay within its bounds.
 
     From the time constant nearest to `here` (sum, time constant) outwards, each from its neighbour's sum.
@@ -213,25 +207,27 @@ def _ridge(cost: Cost, taus: Array, here: tuple[float, float], bounds: tuple[flo
         total = here[0] if order.step > 0 else float(found[0, first])
         for i in order:
             tau = float(taus[i])
-            total, found[1, i], found[2, i] = _best_sum(cost, tau, total, (bounds[0] + tau, bounds[1] + tau), std)
+            limits = bounds[0] + tau, bounds[1] + tau
+            total, found[1, i], found[2, i] = _best_sum(cost, tau, total, limits, std, options)
             found[0, i] = total
     return _Ridge(taus, *found)
 
 
 def _best_sum(
-    cost: Cost, tau: float, total: float, bounds: tuple[float, float], std: float
+    cost: Cost, tau: float, total: float, bounds: tuple[float, float], std: float, options: DiagnosisOptions
 ) -> tuple[float, float, float]:
     """The best sum at a time constant, its sd (at most the prior's std), and the cost there, by Newton's method."""
-    low, high = bounds[0] + SUM_STEP, bounds[1] - SUM_STEP
-    for _ in range(MAX_NEWTON_STEPS):
+    step = options.delay_step
+    low, high = bounds[0] + step, bounds[1] - step
+    for _ in range(12):
         total = min(max(total, low), high)
-        earlier, here, later = (cost(s - tau, tau) for s in (total - SUM_STEP, total, total + SUM_STEP))
-        curvature, slope = (earlier + later - 2.0 * here) / SUM_STEP**2, (later - earlier) / (2.0 * SUM_STEP)
+        earlier, here, later = (cost(s - tau, tau) for s in (total - step, total, total + step))
+        curvature, slope = (earlier + later - 2.0 * here) / step**2, (later - earlier) / (2.0 * step)
         move = -slope / curvature if curvature > 0.0 else -np.sign(slope) * np.inf
-        if abs(move) <= SUM_STEP or not low < min(max(total + move, low), high) < high:
+        if abs(move) <= step or not low < min(max(total + move, low), high) < high:
             break
-        total += float(np.clip(move, -4.0 * SUM_STEP, 4.0 * SUM_STEP))
-    curvature, move = max(curvature, 2.0 / std**2), float(np.clip(move, -SUM_STEP, SUM_STEP))
+        total += float(np.clip(move, -4.0 * step, 4.0 * step))
+    curvature, move = max(curvature, 2.0 / std**2), float(np.clip(move, -step, step))
     return total + move, float(np.sqrt(2.0 / curvature)), here + slope * move + 0.5 * curvature * move**2
 
 

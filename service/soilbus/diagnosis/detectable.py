@@ -23,6 +23,7 @@ from scipy.optimize import brentq
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import (
     JointEquations,
@@ -35,9 +36,6 @@ from soilbus.diagnosis.verdict import required_fall, temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
-
-MAX_PLAUSIBLE_SD = 2.0
-"""Prior standard deviations up to which an effect is plausible: a normal variable exceeds them in one of twenty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,9 @@ def detectable(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> tuple[Detectable, ...]:
     """The detectable size of every candidate beside the present model fitted to these recordings."""
-    required = required_fall(temperature(present.excess), present.gap, present.checked_rows, present.rows)
+    options = records[0].options
+    divisor = temperature(present.excess, options)
+    required = required_fall(divisor, present.gap, present.checked_rows, present.rows, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
     for effects in _with_further_starts(candidates):
@@ -82,7 +82,7 @@ def detectable(
             columns = [i for i, f in enumerate(free) if f.effect == effect.name]
             least = _sampling_delay(effect, records[-1])
             one = _detectable(
-                effect, columns, [free[i] for i in columns], equations, joint, data_ratio, required, least
+                effect, columns, [free[i] for i in columns], equations, joint, data_ratio, required, least, options
             )
             if effect.name not in found or _size(one) < _size(found[effect.name]):
                 found[effect.name] = one
@@ -109,8 +109,10 @@ def _detectable(
     data_ratio: float,
     required: float,
     least: float,
+    options: DiagnosisOptions,
 ) -> Detectable:
     parameter = effect.parameters[0]
+    most = _max_size(parameter, options)
     block = np.ix_(columns, columns)
     if effect.of_record:  # in one recording, while the others pay for parameters that they do not need
         informations = [data_ratio * one.information[block] for one in equations]
@@ -119,9 +121,9 @@ def _detectable(
     else:
         cases = [(data_ratio * joint.information[block], required)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
-    sizes = [min(_least_size(information, i, free, needed) for information, needed in cases) for i in first]
+    sizes = [min(_least_size(information, i, free, needed, most) for information, needed in cases) for i in first]
     size = max(*sizes, least)
-    unseen = min(size, _max_size(parameter))
+    unseen = min(size, most)
     u = np.zeros(len(free))
     u[first[sizes.index(max(sizes))]] = unseen / parameter.std
     by_u = [-one.response for one in equations] if effect.of_record else [by_u for _, by_u in joint.follow]
@@ -134,13 +136,13 @@ def _sampling_delay(effect: Effect, record: Record) -> float:
     return max((record.training.sample_time(quantity) / 2.0 for quantity in [*effect.late][:1]), default=0.0)
 
 
-def _max_size(parameter: Parameter) -> float:
+def _max_size(parameter: Parameter, options: DiagnosisOptions) -> float:
     """The largest plausible size."""
     widest = max(parameter.high - parameter.neutral, parameter.neutral - parameter.low)
-    return min(MAX_PLAUSIBLE_SD * parameter.std, widest)
+    return min(options.max_plausible_sd * parameter.std, widest)
 
 
-def _least_size(information: Array, index: int, free: Sequence[Free], required: float) -> float:
+def _least_size(information: Array, index: int, free: Sequence[Free], required: float, largest: float) -> float:
     """Size of one parameter from which the expected fall of -2 log evidence reaches the required one; else infinite."""
     direction = np.eye(len(free))[index]
     parameter = free[index].parameter
@@ -149,7 +151,7 @@ def _least_size(information: Array, index: int, free: Sequence[Free], required: 
         """Change of -2 log evidence above the negative of the required fall."""
         return _expected_change(information, size * direction, free) + required
 
-    most = _max_size(parameter) / parameter.std
+    most = largest / parameter.std
     return float(brentq(excess, 0.0, most)) * parameter.std if excess(most) <= 0.0 else np.inf
 
 

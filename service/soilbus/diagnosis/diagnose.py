@@ -3,7 +3,7 @@
     gap = reduced chi-square of held-out blocks;  fall = -2 log evidence before - after an effect is added
 
 The present model is fitted and its held-out residuals are tested place by place (`where`).  Effects are added one at a
-time, at most MAX_EFFECTS, by stepwise search (`search`); `verdict` turns evidences and remaining gap into a verdict.
+time, at most three, by stepwise search (`search`); `verdict` turns evidences and remaining gap into a verdict.
 Where the verdict is unknown, `residual_terms` describes what remains; where it is none, `detectable` says what these
 recordings could have shown.
 """
@@ -21,7 +21,7 @@ from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.residual_terms import ResidualTerms, residual_terms
-from soilbus.diagnosis.search import MAX_EFFECTS, THINNING, Addition, FitCache, Search
+from soilbus.diagnosis.search import Addition, FitCache, Search
 from soilbus.diagnosis.verdict import Verdict, temperature, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
@@ -29,12 +29,6 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
 __all__ = ["Diagnosis", "NotFitted", "diagnose"]
-
-MAX_RIVALS = 2
-"""Alternatives that are fitted beside the effect that was added, to find what would tell them apart."""
-MAX_OVERLAP = 0.25
-"""Share by which the sum of what effects explain alone may differ from what they explain together: of 9 blind pairs
-(seed 132) with nothing in common it was 0.96 to 1.08, of 5 that look alike 1.1 to 1.6."""
 
 
 class NotFitted(Exception):
@@ -108,7 +102,7 @@ def diagnose(
     Parameters
     ----------
     records
-        Recordings of one vehicle, each divided into training and held-out blocks.
+        Recordings of one vehicle, each divided into training and held-out blocks; the options of the first count.
     prior
         Of the soil, the same for each recording.
     catalogue
@@ -122,36 +116,38 @@ def diagnose(
         Where already the present model cannot be fitted.
     """
     progress("fitting the present model")
-    full = FitCache(records, prior)
+    options = records[0].options
+    full = FitCache(records, prior, options)
     base = full.fit(records[0].training.effects)
     if base is not None and any(record.training.computes_loads for record in records):
         records = [
             record.with_weights_at(fit.optimum.at, check.at)
             for record, fit, check in zip(records, base.fits, base.checks, strict=True)
         ]
-        full = FitCache(records, prior)
+        full = FitCache(records, prior, options)
         base = full.fit(base.effects, [base.as_starts()])
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
-    thinned = FitCache([record.thinned(THINNING) for record in records], prior)
+    thinned = FitCache([record.thinned(options.thinning) for record in records], prior, options)
     law = records[0].training.model.shear_law
     candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
-    where, present = disagreements(base), base
+    where, present = disagreements(base, options), base
     additions: list[Addition] = []
     progress("looking for effects")
-    for step in Search(full, thinned, base, candidates).steps():
+    for step in Search(full, thinned, base, candidates, options).steps():
         additions, present = step
         progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
-        present = with_delays(records, prior, present, temperature(present.excess))
+        present = with_delays(records, prior, present, temperature(present.excess, options))
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
     after = gap_of(records, prior, present) if additions else before
     imitation = shares_alone(full, base, present, additions)
     chances = [addition.probability for addition in additions]
-    verdict = verdict_of(before.value, after.value, min(before.rows, after.rows), chances, bool(imitation))
+    rows = min(before.rows, after.rows)
+    verdict = verdict_of(before.value, after.value, rows, chances, bool(imitation), options)
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()
     if verdict is Verdict.NONE:
@@ -186,7 +182,7 @@ def rivals_of(
         return ()
     least = min(contested, key=lambda addition: addition.probability)
     others = [effect for effect in present.effects if effect.name != least.effect.name]
-    likeliest = sorted(least.alternatives, key=lambda name: -least.alternatives[name])[:MAX_RIVALS]
+    likeliest = sorted(least.alternatives, key=lambda name: -least.alternatives[name])[:2]
     fits = [full.fit((*others, by_name[name])) for name in likeliest if name not in present.names]
     return (present, *(fit for fit in fits if fit is not None))
 
@@ -196,18 +192,18 @@ def shares_alone(
 ) -> tuple[float, ...]:
     """What each effect explains alone, as a share of what all explain together; empty where nothing is to be doubted.
 
-    Faults that have nothing in common explain together the sum of what each explains alone.  Where MAX_EFFECTS effects
-    do not, the signature of one lies over that of another, which hides it or cancels part of it: an imitation of
-    something that the catalogue lacks is then as likely as that number of faults at once.
+    Faults that have nothing in common explain together the sum of what each explains alone.  Where as
+    many effects as are allowed do not, the signature of one lies over that of another, which hides it or cancels part
+    of it: an imitation of something that the catalogue lacks is then as likely as that number of faults at once.
     """
-    if len(additions) < MAX_EFFECTS:
+    if len(additions) < full.options.max_effects:
         return ()
     alone = [full.fit((*base.effects, addition.effect)) for addition in additions]
     together = base.neg2_log_evidence - present.neg2_log_evidence
     shares = tuple(
         0.0 if one is None else max(base.neg2_log_evidence - one.neg2_log_evidence, 0.0) / together for one in alone
     )
-    return () if abs(sum(shares) - 1.0) < MAX_OVERLAP else shares
+    return () if abs(sum(shares) - 1.0) < full.options.max_overlap else shares
 
 
 def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:

@@ -22,26 +22,20 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, own_parameters
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import COMPARED, Fit, Start, fit_from, fit_window
+from soilbus.estimation.multistart import Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import RESIDUAL, Latents, Linearisation, ObservationModelWithEffects
+from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective, SolverOptions, Termination
+from soilbus.estimation.solver import Iterate, Objective, Termination
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
 _SOIL = len(PARAMETERS)
-# A value whose docstring states no source has no evidence recorded.
-CHECK_ROUNDS, CHECK_ROUNDS_NEAR = 3, 2
-"""Linearisations that bring the latents of held-out blocks to their optimum: from the measurements, and from latents
-under a model much like it."""
-MAX_SWEEPS = 6
-"""Rounds in which each of several recordings is fitted again beside all others.  No evidence recorded."""
-SWEEP_TOLERANCE = 0.1
-"""Change of the shared values, in posterior standard deviations, from which a further round follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +263,7 @@ def fit_model(
     prior: SoilPrior,
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
-    options: SolverOptions = COMPARED,
+    options: SolverOptions | None = None,
 ) -> FittedModel | None:
     """A model with these effects fitted to all recordings.
 
@@ -284,7 +278,7 @@ def fit_model(
     starts
         One for each recording; None searches from several.
     options
-        When a descent stops or is given up.
+        When a descent stops or is given up; by default as DiagnosisOptions says.
 
     Returns
     -------
@@ -292,6 +286,7 @@ def fit_model(
         None where a fit fails or is given up.  A parameter that would leave its range is held at the edge.
     """
     present = records[0].training
+    options = records[0].options.compared if options is None else options
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free_unheld = tuple(
         f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels)
@@ -311,7 +306,9 @@ def fit_model(
         return None
     first_prior, joint_priors, fits = fitted
     checks = [
-        check(record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i])
+        check(
+            record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i], record.options
+        )
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
     added = [effect for effect in effects if effect not in present.effects]
@@ -322,21 +319,24 @@ def fit_model(
 
 
 def check(
-    problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near: Latents | None = None
+    problem: ObservationModelWithEffects,
+    prior: SoilPrior,
+    fit: Fit,
+    near: Latents | None = None,
+    options: DiagnosisOptions = DEFAULT,
 ) -> HeldOutCheck:
     """Held-out blocks under a model fitted to the others.
 
-    near: their latents under a model much like it, from which fewer linearisations are needed.  Evidence and chi2 are
+    near: their latents under a model much like it.  Evidence and chi2 are
     infinite where the model is not finite.
     """
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
     objective = Objective(problem, prior, fit.mode)
-    rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_ROUNDS_NEAR
     with np.errstate(all="ignore"):
         latents = objective.start_near(fit.mode.soil, gains, near).latents
         latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
-        for _ in range(rounds - 1):
+        for _ in range(options.check_rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
         quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents), at)
@@ -374,7 +374,8 @@ def _fits(
         fits.append(fit)
     first = joint_priors[0]
     if len(records) > 1 and records[0].joint_prior is None:
-        joint_priors, fits = _swept(problems, prior, first, own, joint_priors, fits, options)
+        descent = replace(options, give_up_above=np.inf)
+        joint_priors, fits = _swept(problems, prior, first, own, joint_priors, fits, descent)
     return first, joint_priors, fits
 
 
@@ -425,7 +426,7 @@ def _swept(
     own: Sequence[int],
     joint_priors: list[Gaussian],
     fits: list[Fit],
-    options: SolverOptions,
+    descent: SolverOptions,
 ) -> tuple[list[Gaussian], list[Fit]]:
     """Joint priors and fits at the optimum of all recordings together.
 
@@ -435,25 +436,24 @@ def _swept(
     shared = np.setdiff1d(np.flatnonzero(np.diag(first.covariance)[_SOIL:] > 0.0), own)
     if not len(shared):
         return joint_priors, fits
-    options = replace(options, give_up_above=np.inf)
     priors, fits = list(joint_priors), list(fits)
     factors = [_natural(f.mode, shared).without(_natural(p, shared)) for f, p in zip(fits, priors, strict=True)]
     before = _natural(first, shared)
-    for _ in range(MAX_SWEEPS):
+    for _ in range(6):
         moved = 0.0
         for i, problem in enumerate(problems):
             others = before
             for j, factor in enumerate(factors):
                 others = others if j == i else others + factor
             cavity = _with_shared(Gaussian.of(prior, problem.gain_std), shared, others)
-            fit = _fitted(problem, prior, cavity, _start(fits[i]), options)
+            fit = _fitted(problem, prior, cavity, _start(fits[i]), descent)
             if fit is None:
                 continue
             sd = np.sqrt(np.diag(fit.mode.covariance)[_SOIL + shared])
             moved = max(moved, float(np.max(np.abs(fit.mode.gains - fits[i].mode.gains)[shared] / sd)))
             priors[i], fits[i] = cavity, fit
             factors[i] = _natural(fit.mode, shared).without(others)
-        if moved < SWEEP_TOLERANCE:
+        if moved < 0.1:  # posterior sd
             break
     else:
         fits = [replace(fit, termination=Termination.LIMIT) for fit in fits]

@@ -16,12 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
-from soilbus.diagnosis.records import FOLDS, HELD_OUT_FOLD, Record
+from soilbus.diagnosis.records import Record
 from soilbus.estimation.multistart import Start
 from soilbus.estimation.posterior import SoilPrior
-
-MAX_CROSS_VALIDATED = 1.5
-"""Reduced chi-square of one fold beyond which its noise does not matter, and no other fold is held out."""
 
 
 class Gap(NamedTuple):
@@ -34,14 +31,14 @@ class Gap(NamedTuple):
 def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> Gap:
     """The gap of a model that was fitted to these records, over all folds.
 
-    Over the one fold only where its gap exceeds MAX_CROSS_VALIDATED, where no other can be held out (tables), and
+    Over the one fold only where its gap exceeds `max_cross_validated`, where no other can be held out (tables), and
     where the model or a further fit did not converge.
     """
-    one_fold = Gap(fitted.gap, fitted.checked_rows)
-    if not fitted.converged or fitted.gap > MAX_CROSS_VALIDATED:
+    options, one_fold = records[0].options, Gap(fitted.gap, fitted.checked_rows)
+    if not fitted.converged or fitted.gap > options.max_cross_validated:
         return one_fold
     chi2, rows = fitted.gap * fitted.checked_rows, fitted.checked_rows
-    for fold in [fold for fold in range(FOLDS) if fold != HELD_OUT_FOLD]:
+    for fold in range(options.folds - 1):
         divided = [record.with_held_out(fold) for record in records]
         parts = [record for record in divided if record is not None]
         if len(parts) < len(records):
@@ -59,7 +56,7 @@ def _start(record: Record, fold: int, end: Start) -> Start:
     """Where a fit ended, as a start of one to other blocks of the recording."""
     if end.latents is None or end.checked is None or record.fold is None:
         return end._replace(latents=None, checked=None)
-    held_out = record.fold == HELD_OUT_FOLD
+    held_out = record.fold == record.options.folds - 1
     indices = np.concatenate([np.flatnonzero(~held_out), np.flatnonzero(held_out)])
     whole = end.latents.followed_by(len(end.latents.load), end.checked).part(np.argsort(indices))
     return end._replace(latents=whole.part(record.fold != fold), checked=whole.part(record.fold == fold))

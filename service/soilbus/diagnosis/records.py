@@ -1,6 +1,6 @@
 """Recordings divided for the diagnosis: training blocks that models are fitted to, and held-out blocks.
 
-    fold = floor(t / BLOCK) mod FOLDS,  the last fold is held out
+    fold = floor(t / block) mod folds,  the last fold is held out
 
 Successive instants are correlated, so whole time blocks are held out, in turn with the training blocks.  A table of
 steady states has no time: each third row in the order of slip is held out.
@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import Linearisation, ObservationModelWithEffects
@@ -23,17 +24,6 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
 
 __all__ = ["Record", "TooLittle", "record_of", "record_of_rows"]
-
-BLOCK = 4.0
-"""Length of a time block [s]: long beside a sensor's lag, short beside a sweep of slip."""
-FOLDS = 3
-"""Folds that the blocks belong to by turns."""
-HELD_OUT_FOLD = FOLDS - 1
-"""The fold that is held out."""
-MIN_INSTANTS = 12
-"""Instants that each part of a recording must have."""
-MIN_ROWS = 5
-"""Rows that a table must have."""
 
 
 class TooLittle(ValueError):
@@ -55,6 +45,8 @@ class Record:
         first recording.
     whole, fold
         Observation model of all instants, and the fold (N,) of each; None where no other fold can be held out.
+    options
+        Of its diagnosis.
     """
 
     name: str
@@ -63,6 +55,7 @@ class Record:
     joint_prior: Gaussian | None = None
     whole: ObservationModelWithEffects | None = None
     fold: NDArray[np.intp] | None = None
+    options: DiagnosisOptions = DEFAULT
 
     def with_effects(
         self, effects: Sequence[Effect], free: Sequence[Free], joint_prior: Gaussian | None = None
@@ -70,7 +63,7 @@ class Record:
         """The same under a model with these effects and parameters."""
         training, held_out = (part.with_effects(effects, free) for part in (self.training, self.held_out))
         whole = None if self.whole is None else self.whole.with_effects(effects, free)
-        return Record(self.name, training, held_out, joint_prior, whole, self.fold)
+        return replace(self, training=training, held_out=held_out, joint_prior=joint_prior, whole=whole)
 
     def with_held_out(self, fold: int) -> Record | None:
         """The same with another fold held out; None where that cannot be."""
@@ -85,7 +78,8 @@ class Record:
         if self.whole is None or self.fold is None or parts[0].held_covariance is None:
             return replace(self, training=parts[0], held_out=parts[1])
         whole, covariance = copy(self.whole), np.empty((self.whole.n, *parts[0].held_covariance.shape[1:]))
-        for part, of_part in zip(parts, (self.fold != HELD_OUT_FOLD, self.fold == HELD_OUT_FOLD), strict=True):
+        is_held_out = self.fold == self.options.folds - 1
+        for part, of_part in zip(parts, (~is_held_out, is_held_out), strict=True):
             covariance[of_part] = part.held_covariance
         whole.held_covariance = covariance
         return replace(self, training=parts[0], held_out=parts[1], whole=whole)
@@ -93,11 +87,20 @@ class Record:
     def thinned(self, every: int) -> Record:
         """The same with each `every`-th instant; a table of few rows keeps all of them."""
         parts = self.training, self.held_out
-        training, held_out = (part.part(slice(None, None, min(every, part.n // MIN_INSTANTS + 1))) for part in parts)
-        return Record(self.name, training, held_out, self.joint_prior)
+        least = self.options.min_instants
+        training, held_out = (part.part(slice(None, None, min(every, part.n // least + 1))) for part in parts)
+        return replace(self, training=training, held_out=held_out, whole=None, fold=None)
 
 
-def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
+def record_of(
+    name: str,
+    window: Window,
+    rig: Rig,
+    model: WheelModel,
+    min_speed: float,
+    max_turn: float,
+    options: DiagnosisOptions = DEFAULT,
+) -> Record:
     """One recording divided into blocks.
 
     Parameters
@@ -110,6 +113,8 @@ def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed:
         The vehicle and its wheel-soil model.
     min_speed, max_turn
         Limits within which an instant is usable: speed [m/s], relative difference of an axle's rim speeds [1].
+    options
+        Of its diagnosis.
 
     Raises
     ------
@@ -117,15 +122,18 @@ def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed:
         Where the recording has not enough usable instants.
     """
     problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn)
-    fold = folds(problem.since)
-    parts = np.flatnonzero(fold != HELD_OUT_FOLD), np.flatnonzero(fold == HELD_OUT_FOLD)
-    if min(map(len, parts)) < MIN_INSTANTS:
+    fold = folds(problem.since, options)
+    is_held_out = fold == options.folds - 1
+    parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
+    if min(map(len, parts)) < options.min_instants:
         raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
     training, held_out = (problem.part(part) for part in parts)
-    return Record(name, training, held_out, whole=problem, fold=fold)
+    return Record(name, training, held_out, whole=problem, fold=fold, options=options)
 
 
-def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Record:
+def record_of_rows(
+    name: str, window: Window, rig: Rig, model: WheelModel, options: DiagnosisOptions = DEFAULT
+) -> Record:
     """A table of steady states, of which a third is held out.
 
     Rows are not correlated in time as the instants of a drive are, and blocks of them would only separate small slips
@@ -137,16 +145,16 @@ def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Re
         Where the table has not enough usable rows.
     """
     problem = ObservationModelWithEffects(window, rig, model, min_speed=0.0)
-    if problem.n < MIN_ROWS:
+    if problem.n < 5:
         raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
     rank = np.argsort(np.argsort(problem.slip.mean(1), kind="stable"))
-    held_out_rows = rank % FOLDS == FOLDS // 2
+    held_out_rows = rank % options.folds == options.folds // 2
     training, held_out = (problem.part(np.flatnonzero(part)) for part in (~held_out_rows, held_out_rows))
-    return Record(name, training, held_out)
+    return Record(name, training, held_out, options=options)
 
 
-def folds(since: NDArray[np.float64]) -> NDArray[np.intp]:
+def folds(since: NDArray[np.float64], options: DiagnosisOptions) -> NDArray[np.intp]:
     """Fold (N,) of instants at these times (N,) [s] since the start: blocks by turns."""
     span = float(since[-1] - since[0]) if len(since) else 0.0
-    length = min(BLOCK, span / (3 * FOLDS)) if span > 0.0 else BLOCK
-    return np.asarray((since / max(length, 1e-9)).astype(int) % FOLDS)
+    length = min(options.block, span / (3 * options.folds)) if span > 0.0 else options.block
+    return np.asarray((since / max(length, 1e-9)).astype(int) % options.folds)

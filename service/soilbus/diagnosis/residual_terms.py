@@ -18,21 +18,13 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
 
 __all__ = ["WARNING", "ResidualTerms", "Term", "residual_terms"]
 
-# A value whose docstring states no source has no evidence recorded.
-MAX_TERMS = 3
-"""Terms of a channel."""
-MIN_RESIDUALS = 20
-"""Residuals up to which nothing is selected."""
-HARMONICS = (1, 2)
-"""Of the wheel angle, as regressors."""
-MIN_EXPLAINED_SHARE = 0.1
-"""Share of a channel's held-out excess chi-square that a description must explain to be reported."""
 WARNING = (
     "learned from these recordings alone: a description within the range driven, not a mechanism; "
     "do not rely on it on other ground or outside that range"
@@ -65,15 +57,15 @@ class ResidualTerms:
 
 def residual_terms(records: Sequence[Record], fitted: FittedModel) -> list[ResidualTerms]:
     """Descriptions of what a fitted model leaves, one a channel, the one that explains most first."""
-    found = []
+    found, options = [], records[0].options
     names = records[0].training.row_channels
     for column, (channel, wheel) in enumerate(names):
         training, held_out = (_joined(list(part)) for part in zip(*_samples(records, fitted, column), strict=True))
         if not len(training.z) or not len(held_out.z):  # a channel that is not there
             continue
-        terms = _selected(training)
+        terms = _selected(training, options)
         explained = _explained(held_out, terms)
-        if terms and explained > MIN_EXPLAINED_SHARE:
+        if terms and explained > options.min_explained_share:
             found.append(ResidualTerms(channel, wheel, tuple(terms), explained))
     return sorted(found, key=lambda description: -description.explained)
 
@@ -117,7 +109,7 @@ def _sample(
     by["draft"] = problem.draft / max(float(np.abs(problem.draft).mean()), 1e-9)
     products = {f"{a} {b}": by[a] * by[b] for a, b in (("slip", "slip"), ("slip", "load"), ("slip", "speed"))}
     angle = problem.wheel_angle.mean(1) if own is None else problem.wheel_angle[:, own]
-    waves = {f"{f.__name__}({k} wheel angle)": f(k * angle) for k in HARMONICS for f in (np.sin, np.cos)}
+    waves = {f"{f.__name__}({k} wheel angle)": f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)}
     regressors = {"1": np.ones(len(z))} | by | products | waves
     return _Sample(z[known, column], np.full(int(known.sum()), scale), {n: v[known] for n, v in regressors.items()})
 
@@ -131,11 +123,11 @@ def _joined(parts: list[_Sample]) -> _Sample:
     )
 
 
-def _selected(sample: _Sample) -> list[Term]:
+def _selected(sample: _Sample, options: DiagnosisOptions) -> list[Term]:
     """Terms by forward selection while BIC, with the choice among candidates counted, falls."""
     chosen: list[str] = []
     chi2, n = float(sample.z @ sample.z), len(sample.z)
-    while len(chosen) < MAX_TERMS and n > MIN_RESIDUALS:
+    while len(chosen) < options.max_terms and n > options.where_residuals:
         trials = {name: _chi2_after(sample, [*chosen, name]) for name in sample.regressors if name not in chosen}
         best = min(trials, key=lambda name: trials[name])
         if chi2 - trials[best] < 2.0 * math.log(n) + 2.0 * math.log(len(trials)):

@@ -35,9 +35,6 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.effects.effect import Effect
 
-MAX_START_SD = 2.0
-"""Prior standard deviations to which a start's parameters are confined, as the model is linear near the fit only."""
-
 
 @dataclass(frozen=True, slots=True)
 class Score:
@@ -59,7 +56,7 @@ class NormalEquations:
 
     gradient (P,) and information (P, P) are of the data alone, without the parameters' prior.  response (C, P) is
     H_cc^-1 H_cu: the present coordinates follow a step u by -response u.  fitted is the present model.
-    is_own (C,): which present coordinates belong to this recording alone.
+    is_own (C,): which present coordinates belong to this recording alone.  max_start_sd: see DiagnosisOptions.
     """
 
     objective: Objective
@@ -71,6 +68,7 @@ class NormalEquations:
     response: Array
     held_out_latents: Latents
     fitted: FittedModel
+    max_start_sd: float
 
     @property
     def shared_gains(self) -> NDArray[np.intp]:
@@ -286,7 +284,18 @@ def _reduced(
         if by_name[f.effect].own_in_each_record(f.parameter)
     ]
     is_own = np.concatenate([np.ones(len(objective.free), bool), np.isin(objective.active[:-P], own)])
-    return NormalEquations(objective, iterate, quadratic, is_own, gradient, reduced, response, held_out, present)
+    return NormalEquations(
+        objective,
+        iterate,
+        quadratic,
+        is_own,
+        gradient,
+        reduced,
+        response,
+        held_out,
+        present,
+        record.options.max_start_sd,
+    )
 
 
 def _score(
@@ -351,11 +360,11 @@ def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) 
 def _start(
     equations: NormalEquations, columns: NDArray[np.intp], step: Array, offset: Array | float, by_u: Array
 ) -> Start:
-    """Where a fit of one recording with the effect begins: at the step (P,), shortened to MAX_START_SD.
+    """Where a fit of one recording with the effect begins: at the step (P,), shortened to `max_start_sd`.
 
     offset (C,) and by_u (C, P): what the present coordinates change by, and by each of all parameters.
     """
-    share = min(1.0, MAX_START_SD / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    share = min(1.0, equations.max_start_sd / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     step = share * step
     follow = offset + by_u[:, columns] @ step
     objective, iterate = equations.objective, equations.iterate

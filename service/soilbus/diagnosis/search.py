@@ -6,7 +6,7 @@
         swap it where another explains more, remove it where its fall is below the required one
 
 A comparison has three stages.  Score tests name the candidates that can explain something and say where their fits
-begin; each is fitted to every THINNING-th instant, from all its starts; from there those that can still win are fitted
+begin; each is fitted to a part of the instants, from all its starts; from there those that can still win are fitted
 to all instants.  FitCache keeps every fit.
 """
 
@@ -18,10 +18,10 @@ from dataclasses import dataclass, field, replace
 
 from soilbus.diagnosis.delays import exceeds_sampling_delay
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Score, further_scores, scores
 from soilbus.diagnosis.verdict import (
-    SET_PROBABILITY,
     dominated_deficit,
     gap_limit,
     mean_soil_error_share,
@@ -29,22 +29,10 @@ from soilbus.diagnosis.verdict import (
     required_fall,
     temperature,
 )
-from soilbus.estimation.multistart import COMPARED, Start
+from soilbus.estimation.multistart import Start
+from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.solver import SolverOptions
 from soilbus.terra.effects.effect import Effect
-
-MAX_EFFECTS = 3
-"""Effects that are added at most."""
-MAX_CANDIDATES = 6
-"""Candidates that a comparison fits, the best by their scores: of 82 single effects of the blind seeds 211 and 212 the
-hidden one is among the first three of 77, and of the others behind the thirteenth."""
-THINNING = 4
-"""The first fit of a candidate has one instant in this many."""
-TRIAL_OPTIONS = replace(COMPARED, step_tolerance=0.1)
-"""Stopping rule of that fit: looser, as it is only a start."""
-NEGLIGIBLE_FALL = 1.0
-"""Fall of -2 log posterior or evidence up to which two models are equally good: odds of e^0.5."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +74,8 @@ class Search:
         The model without any addition.
     candidates
         Effects that may be missing.
+    options
+        Of the diagnosis.
     temperature
         Of the recordings, by what the base leaves.
     """
@@ -94,21 +84,22 @@ class Search:
     thinned: FitCache
     base: FittedModel
     candidates: Sequence[Effect]
+    options: DiagnosisOptions = DEFAULT
     temperature: float = field(init=False)
     _compared: dict[frozenset[str], dict[str, FittedModel]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.temperature = temperature(self.base.excess)
+        self.temperature = temperature(self.base.excess, self.options)
 
     def steps(self) -> Iterator[tuple[list[Addition], FittedModel]]:
         """After each addition and its swaps: the additions in the order of the model's effects, and the model."""
         present = self.base
-        while len(self.added(present)) < MAX_EFFECTS:
+        while len(self.added(present)) < self.options.max_effects:
             wider = self.best(present)
             if wider is None or self._falls_short(present, wider):
                 return
             found = self.with_swaps(wider)
-            if found.neg2_log_evidence > present.neg2_log_evidence - NEGLIGIBLE_FALL:
+            if found.neg2_log_evidence > present.neg2_log_evidence - self.options.negligible_fall:
                 return
             present = found
             yield [self.addition(present, effect) for effect in self.added(present)], present
@@ -130,7 +121,8 @@ class Search:
                 if without is None:
                     continue
                 other = self.best(without)
-                if other is not None and other.neg2_log_evidence < model.neg2_log_evidence - NEGLIGIBLE_FALL:
+                enough = model.neg2_log_evidence - self.options.negligible_fall
+                if other is not None and other.neg2_log_evidence < enough:
                     better = other
                 elif self._falls_short(without, model):
                     better = without
@@ -162,24 +154,26 @@ class Search:
         falls = {name: beside.neg2_log_evidence - fit.neg2_log_evidence for name, fit in fits.items()}
         by_name = {e.name: e for e in (effect, *self.candidates)}
         chances = probabilities(falls, self.temperature, {n: fit.own_parameters(by_name[n]) for n, fit in fits.items()})
-        others = {n: p for n, p in chances.items() if n != effect.name and p >= SET_PROBABILITY}
-        share = mean_soil_error_share({n: p for n, p in chances.items() if n == effect.name or n in others})
+        others = {n: p for n, p in chances.items() if n != effect.name and p >= self.options.set_probability}
+        in_set = {n: p for n, p in chances.items() if n == effect.name or n in others}
+        share = mean_soil_error_share(in_set, self.options)
         ordered = dict(sorted(falls.items(), key=lambda item: -item[1]))
         return Addition(effect, chances[effect.name], others, ordered, share, self.temperature)
 
     def _fits(self, model: FittedModel) -> Iterator[tuple[str, FittedModel]]:
         """Fits of the candidates to all instants, by name; without those that cannot win."""
         trials: list[tuple[FittedModel, list[Score]]] = []
-        limit, margin = math.inf, dominated_deficit(self.temperature)
-        for of_one in self._by_score(model)[:MAX_CANDIDATES]:
+        limit, margin = math.inf, dominated_deficit(self.temperature, self.options)
+        for of_one in self._by_score(model)[: self.options.max_candidates]:
             effects, starts = (*model.effects, of_one[0].effect), [score.starts for score in of_one]
-            trial = self.thinned.fit(effects, starts, replace(TRIAL_OPTIONS, give_up_above=limit))
+            trial = self.thinned.fit(effects, starts, replace(self.options.compared, give_up_above=limit))
             if trial is not None:
                 trials.append((trial, of_one))
                 limit = min(limit, trial.neg2_log_posterior + margin)
         limit = math.inf
         for trial, of_one in sorted(trials, key=lambda one: one[0].neg2_log_posterior):
-            fit = self.full.fit(trial.effects, [trial.as_starts()], replace(COMPARED, give_up_above=limit))
+            descent = replace(self.options.compared, give_up_above=limit)
+            fit = self.full.fit(trial.effects, [trial.as_starts()], descent)
             if fit is None:
                 continue
             promising = [s for s in of_one if model.neg2_log_evidence + s.neg2_log_evidence < fit.neg2_log_evidence]
@@ -208,7 +202,7 @@ class Search:
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
         """Whether an effect explains less than the required fall."""
-        required = required_fall(self.temperature, without.gap, without.checked_rows, without.rows)
+        required = required_fall(self.temperature, without.gap, without.checked_rows, without.rows, self.options)
         return without.neg2_log_evidence - model.neg2_log_evidence < required
 
     def _is_sampling_delay(self, without: FittedModel, model: FittedModel) -> bool:
@@ -216,7 +210,7 @@ class Search:
         effect = model.effects[-1]
         return (
             bool(effect.late)
-            and without.gap <= gap_limit(without.checked_rows)
+            and without.gap <= gap_limit(without.checked_rows, self.options)
             and not exceeds_sampling_delay(self.full.records, self.full.prior, model, effect, self.temperature)
         )
 
@@ -227,15 +221,15 @@ class FitCache:
     A set of effects whose fit converged is not fitted again, except where a model with fewer effects explains as much.
     """
 
-    def __init__(self, records: Sequence[Record], prior: SoilPrior) -> None:
-        self.records, self.prior = tuple(records), prior
+    def __init__(self, records: Sequence[Record], prior: SoilPrior, options: DiagnosisOptions = DEFAULT) -> None:
+        self.records, self.prior, self.options = tuple(records), prior, options
         self._converged: dict[frozenset[str], FittedModel] = {}
 
     def fit(
         self,
         effects: Sequence[Effect],
         starts: Sequence[Sequence[Start]] = (),
-        options: SolverOptions = COMPARED,
+        options: SolverOptions | None = None,
     ) -> FittedModel | None:
         """The best fit with these effects.
 
@@ -246,7 +240,7 @@ class FitCache:
         starts
             Each a Start for each recording; none searches from several.
         options
-            When a descent stops or is given up.
+            When a descent stops or is given up; by default as DiagnosisOptions says.
 
         Returns
         -------
@@ -255,11 +249,12 @@ class FitCache:
         """
         names = frozenset(effect.name for effect in effects)
         best, fewer = self._converged.get(names), self._with_fewer(names)
-        if best is not None and not _explains_nothing(best, fewer):
+        if best is not None and not self._explains_nothing(best, fewer):
             return best
         for start in starts or (None,):
             best = _better(best, fit_model(self.records, self.prior, effects, start, options))
-        if fewer is not None and math.isinf(options.give_up_above) and _explains_nothing(best, fewer):
+        may_give_up = options is not None and math.isfinite(options.give_up_above)
+        if fewer is not None and not may_give_up and self._explains_nothing(best, fewer):
             best = _better(best, fit_model(self.records, self.prior, effects, fewer.as_starts(effects), options))
         return self._kept(best)
 
@@ -280,12 +275,11 @@ class FitCache:
         fits = [fit for fewer, fit in self._converged.items() if fewer < names]
         return min(fits, key=lambda fit: fit.neg2_log_posterior, default=None)
 
-
-def _explains_nothing(fit: FittedModel | None, with_fewer: FittedModel | None) -> bool:
-    """Whether a model fits no better than one with a subset of its effects: from another start it may."""
-    return with_fewer is not None and (
-        fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - NEGLIGIBLE_FALL
-    )
+    def _explains_nothing(self, fit: FittedModel | None, with_fewer: FittedModel | None) -> bool:
+        """Whether a model fits no better than one with a subset of its effects: from another start it may."""
+        return with_fewer is not None and (
+            fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - self.options.negligible_fall
+        )
 
 
 def _better(one: FittedModel | None, other: FittedModel | None) -> FittedModel | None:

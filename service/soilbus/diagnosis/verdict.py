@@ -22,40 +22,11 @@ import numpy as np
 from scipy.special import softmax
 
 from soilbus.diagnosis.evidence import OwnParameters
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.terra.effects.catalogue import CATALOGUE
 
-MAX_EXCESS = 10000.0
-"""Excess from which on evidence counts no less: without it 4 of 24 blind pairs (seeds 301 to 303) lose their smaller
-effect."""
-ALPHA, ZETA_0 = 400.0, 0.5
-"""Excess of squared residuals at which evidence counts half as much, and how much it counts without excess.
-
-Of 140 blind cases (seeds 211 and 212) names are right about as often as their probability says; with 200 to 2000, and
-1/3 to 2/3, as many single effects are named first.  Other seeds: service/docs/diagnosis.md.
-"""
 TEMPERED_FALL_OF_NONE = 2.0 * math.log(len(CATALOGUE))
 """Tempered fall from which an effect is more probable than none."""
-LEAST_GAP_SHARE = 0.25
-"""Share of a real gap's excess over noise that an effect must explain to be added.  Without it 6 of 18 cases outside
-the catalogue (seeds 211 and 212) get names beside the verdict `unknown`, with it 2."""
-
-NAMED_PROBABILITY = 0.8
-"""Probability from which a name stands alone."""
-SET_PROBABILITY = 0.02
-"""Probability from which a name belongs to the set."""
-MAX_UNEXPLAINED_SHARE = 0.15
-"""Share of the gap's excess over noise that named effects may leave, as no formula is that of the field.  Of 400 blind
-cases (seeds 211 to 303) 0.1 and 0.2 change one verdict each."""
-GAP_LIMIT_SD = 4.0
-"""Standard deviations of a reduced chi-square beyond which a gap is real."""
-LEAST_GAP_LIMIT = 1.04
-"""Reduced chi-square up to which no gap is reported, however many residuals: noise is not known better."""
-
-SOIL_ERROR_SHARE = 0.125
-"""Share of what an effect changes of the soil's parameters by which these are off (standard deviation), as no
-effect's formula is the field's: of the blind `tune` halves of seeds 109 to 113."""
-SOIL_ERROR_SHARE_OF: Mapping[str, float] = MappingProxyType({"tyre_deflection": 1.0})
-"""The same by name, for effects whose share is another."""
 
 
 class Verdict(StrEnum):
@@ -67,7 +38,14 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
-def verdict_of(before: float, after: float, rows: int, chances: Sequence[float], imitation: bool = False) -> Verdict:
+def verdict_of(
+    before: float,
+    after: float,
+    rows: int,
+    chances: Sequence[float],
+    imitation: bool = False,
+    options: DiagnosisOptions = DEFAULT,
+) -> Verdict:
     """The verdict of a diagnosis.
 
     Parameters
@@ -81,34 +59,36 @@ def verdict_of(before: float, after: float, rows: int, chances: Sequence[float],
     imitation
         Whether the effects explain the data only together, see `diagnose.shares_alone`.
     """
-    if is_unexplained(before, after, rows):
+    if is_unexplained(before, after, rows, options):
         return Verdict.UNKNOWN
     if not chances:
         return Verdict.NONE
-    return Verdict.NAMED if min(chances) >= NAMED_PROBABILITY and not imitation else Verdict.AMBIGUOUS
+    return Verdict.NAMED if min(chances) >= options.named_probability and not imitation else Verdict.AMBIGUOUS
 
 
-def is_unexplained(before: float, after: float, checked_rows: int) -> bool:
+def is_unexplained(before: float, after: float, checked_rows: int, options: DiagnosisOptions = DEFAULT) -> bool:
     """Whether a gap (reduced chi-square) remains that the effects added do not explain."""
-    return after > gap_limit(checked_rows) and after - 1.0 > MAX_UNEXPLAINED_SHARE * (before - 1.0)
+    return after > gap_limit(checked_rows, options) and after - 1.0 > options.max_unexplained_share * (before - 1.0)
 
 
-def gap_limit(rows: int) -> float:
+def gap_limit(rows: int, options: DiagnosisOptions = DEFAULT) -> float:
     """Reduced chi-square of this number of held-out residuals up to which noise explains them."""
-    return max(LEAST_GAP_LIMIT, 1.0 + GAP_LIMIT_SD * math.sqrt(2.0 / max(rows, 1)))
+    return max(options.least_gap_limit, 1.0 + options.gap_limit_sd * math.sqrt(2.0 / max(rows, 1)))
 
 
-def temperature(excess: float) -> float:
+def temperature(excess: float, options: DiagnosisOptions = DEFAULT) -> float:
     """T = 1 / zeta where the present model's squared residuals exceed their number by this much."""
-    return (1.0 + min(max(excess, 0.0), MAX_EXCESS) / ALPHA) / ZETA_0
+    return (1.0 + min(max(excess, 0.0), options.max_excess) / options.alpha) / options.zeta_0
 
 
-def temperature_of_all(temperatures: Sequence[float]) -> float:
+def temperature_of_all(temperatures: Sequence[float], options: DiagnosisOptions = DEFAULT) -> float:
     """T of recordings together, from that of each: their excesses add up."""
-    return sum(temperatures) - (len(temperatures) - 1) / ZETA_0
+    return sum(temperatures) - (len(temperatures) - 1) / options.zeta_0
 
 
-def required_fall(divisor: float, gap: float, checked_rows: int, rows: int) -> float:
+def required_fall(
+    divisor: float, gap: float, checked_rows: int, rows: int, options: DiagnosisOptions = DEFAULT
+) -> float:
     """Fall of -2 log evidence from which an effect is added.
 
     Parameters
@@ -120,8 +100,8 @@ def required_fall(divisor: float, gap: float, checked_rows: int, rows: int) -> f
     rows
         Residuals of all blocks.
     """
-    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    return max(least_required_fall(divisor), LEAST_GAP_SHARE * excess)
+    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows, options) else 0.0
+    return max(least_required_fall(divisor), options.least_gap_share * excess)
 
 
 def least_required_fall(divisor: float) -> float:
@@ -129,13 +109,13 @@ def least_required_fall(divisor: float) -> float:
     return TEMPERED_FALL_OF_NONE * divisor
 
 
-def dominated_deficit(divisor: float) -> float:
+def dominated_deficit(divisor: float, options: DiagnosisOptions = DEFAULT) -> float:
     """-2 log posterior above the best candidate's from which a candidate cannot get into the set of names.
 
-    Twice the deficit of -2 log evidence at which its probability is SET_PROBABILITY: the posterior lacks the penalty
+    Twice the deficit of -2 log evidence at which its probability is `set_probability`: the posterior lacks the penalty
     for parameters.
     """
-    return -4.0 * math.log(SET_PROBABILITY) * divisor
+    return -4.0 * math.log(options.set_probability) * divisor
 
 
 def probabilities(
@@ -169,11 +149,12 @@ def probabilities(
     return dict(sorted(zip(falls, chances, strict=True), key=lambda item: -item[1]))
 
 
-def soil_error_share(name: str) -> float:
+def soil_error_share(name: str, options: DiagnosisOptions = DEFAULT) -> float:
     """Share of the change of the soil's parameters by an effect of this name that counts as a standard deviation."""
-    return SOIL_ERROR_SHARE_OF.get(name, SOIL_ERROR_SHARE)
+    return options.tyre_soil_error_share if name == "tyre_deflection" else options.soil_error_share
 
 
-def mean_soil_error_share(chances: Mapping[str, float]) -> float:
+def mean_soil_error_share(chances: Mapping[str, float], options: DiagnosisOptions = DEFAULT) -> float:
     """Root mean square of the shares of these names, weighted by their probabilities."""
-    return math.sqrt(sum(p * soil_error_share(name) ** 2 for name, p in chances.items()) / sum(chances.values()))
+    square = sum(p * soil_error_share(name, options) ** 2 for name, p in chances.items())
+    return math.sqrt(square / sum(chances.values()))

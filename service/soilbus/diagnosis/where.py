@@ -20,15 +20,9 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.posterior import PARAMETERS
 
-# A value whose docstring states no source has no evidence recorded.
-MIN_RESIDUALS = 20
-"""Residuals that a region must have."""
-SIGNIFICANCE_LEVEL = 0.01
-"""Probability under noise alone, corrected for all tests, below which a disagreement is reported."""
-MIN_VARIANCE_SHARE = 0.01
-"""Share of a gain's prior variance that the data must determine for its error to be tested."""
 _SOIL = len(PARAMETERS)
 _REGRESSORS = ("slip", "load", "speed", "time")
 
@@ -70,21 +64,21 @@ class _Test:
     deviations: float
 
 
-def disagreements(fitted: FittedModel) -> list[Disagreement]:
+def disagreements(fitted: FittedModel, options: DiagnosisOptions = DEFAULT) -> list[Disagreement]:
     """All significant disagreements of the held-out blocks, the clearest first."""
-    tests = [test for i, check in enumerate(fitted.checks) for test in _tests(check, fitted, i)]
-    tests += list(_gain_tests(fitted))
+    tests = [test for i, check in enumerate(fitted.checks) for test in _tests(check, fitted, i, options)]
+    tests += list(_gain_tests(fitted, options))
     tests.sort(key=lambda test: -abs(test.deviations))
     found, worst = [], 0.0
     for rank, test in enumerate(tests):
         worst = max(worst, min(1.0, math.erfc(abs(test.deviations) / math.sqrt(2.0)) * (len(tests) - rank)))
-        if worst > SIGNIFICANCE_LEVEL:
+        if worst > options.significance:
             break
         found.append(Disagreement(test.channel, test.wheel, test.region, test.size, worst))
     return found
 
 
-def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_Test]:
+def _tests(check: HeldOutCheck, fitted: FittedModel, record: int, options: DiagnosisOptions) -> Iterator[_Test]:
     """The tests of one recording: mean by region, and scatter, of each channel."""
     problem, gaussian = check.problem, fitted.fits[record].mode
     z, slopes = problem.standardised(check.at, gaussian.gains)
@@ -101,13 +95,13 @@ def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_T
             "time": problem.since,
         }
         known = np.isfinite(z[:, i])
-        for region, members in _regions(regressors, known):
+        for region, members in _regions(regressors, known, options.where_residuals):
             n = len(members)
             mean, slope = z[members, i].mean(), slopes[members, i].mean(0)
             sd = math.sqrt(1.0 / n + float(slope @ gaussian.covariance @ slope))
             yield _Test(channel, wheel, region, float(raw[members, i].mean()), mean / sd)
         n = int(known.sum())
-        if n >= MIN_RESIDUALS:
+        if n >= options.where_residuals:
             square = float((z[known, i] ** 2).mean())
             uncertain = gaussian.covariance @ (
                 slopes[known, i].T @ slopes[known, i]
@@ -118,10 +112,12 @@ def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_T
             yield _Test(channel, wheel, "scatter", math.sqrt(square), larger)
 
 
-def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator[tuple[str, NDArray[np.intp]]]:
-    """Everywhere, and each third of each regressor, where there is enough in it."""
+def _regions(
+    regressors: dict[str, Array], known: NDArray[np.bool_], least: int
+) -> Iterator[tuple[str, NDArray[np.intp]]]:
+    """Everywhere, and each third of each regressor, where there are `least` residuals in it."""
     every = np.flatnonzero(known)
-    if len(every) < MIN_RESIDUALS:
+    if len(every) < least:
         return
     yield "everywhere", every
     for name in _REGRESSORS:
@@ -131,17 +127,17 @@ def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator
             continue
         for low, high in pairwise(edges.tolist()):
             members = every[(values[every] >= low) & (values[every] <= high)]
-            if len(members) >= MIN_RESIDUALS:
+            if len(members) >= least:
                 yield f"{name} {low:.3g}..{high:.3g}", members
 
 
-def _gain_tests(fitted: FittedModel) -> Iterator[_Test]:
+def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[_Test]:
     """Tests of the gain errors against their priors: a fit may hide an effect in them."""
     problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
     for i in range(problem.n_sensors):
         std = float(problem.gain_std[i])
         shift_variance = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # of the posterior mean, under noise
-        if std > 0.0 and shift_variance > MIN_VARIANCE_SHARE * std**2:
+        if std > 0.0 and shift_variance > options.min_variance_share * std**2:
             quantity, _, wheel = problem.gain_names[i].partition(".")
             gain = float(gaussian.gains[i])
             yield _Test(quantity, wheel, "gain", gain, gain / math.sqrt(shift_variance))

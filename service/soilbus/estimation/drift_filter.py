@@ -27,13 +27,6 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.path_curvature import by_curvature
 from soilbus.estimation.solver import GaussianApproximation, Objective
 
-PIECES = 5
-"""Pieces of a window, each with its own soil; no evidence recorded."""
-STEADY_DRIFT_SD = 7.0
-"""Prior sd of a steady change of the soil in one window, in units of `drift`; no evidence recorded."""
-_ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
-"""Ends of the pieces, in windows."""
-
 
 class DriftStep(NamedTuple):
     """From the optimum of a constant soil to the soil at the window's end, of F coordinates and A active gains.
@@ -74,11 +67,14 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
     if constant is None:
         return fit
     free = len(objective.free)
-    models = _drift_models(_joint(objective, fit, constant, window, drift), len(constant.step), free, drift)
+    options = objective.problem.options.posterior
+    steady = options.steady_drift_sd * drift
+    models = _drift_models(_joint(objective, fit, constant, window, drift), len(constant.step), free, steady)
     if not models:
         return fit
     step, covariance = _model_average(models)
-    covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
+    within_piece = drift**2 / (3.0 * options.drift_pieces)  # the end of the last piece is not its mean
+    covariance[:free, :free] += np.eye(free) * within_piece
     at_optimum = objective.gaussian(optimum.soil, optimum.gains, constant.covariance)
     drift_covariance = covariance - constant.covariance
 
@@ -97,11 +93,11 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
     )
 
 
-def _drift_models(joint: Array, n_reported: int, free: int, drift: float) -> list[DriftStep]:
+def _drift_models(joint: Array, n_reported: int, free: int, steady: float) -> list[DriftStep]:
     """Steps under the two models, walk alone and walk with a steady change; those that are finite."""
-    walk, steady = len(joint) - free, STEADY_DRIFT_SD * drift
+    walk = len(joint) - free
     models = [_marginal_step(joint[:walk, :walk], n_reported)]
-    if drift:
+    if steady:
         of_steady = np.arange(walk, len(joint))
         joint[of_steady, of_steady] += 1.0 / steady**2
         models.append(_marginal_step(joint, n_reported, 2.0 * free * math.log(steady)))
@@ -132,8 +128,9 @@ def _joint(objective: Objective, fit: Fit, constant: GaussianApproximation, wind
     joint[0, 1:] = joint[1:, 0] = to_window_start.T @ prior.gradient
     curvature_columns = np.arange(1 + n_reported, len(joint) - free)
     joint[curvature_columns, curvature_columns] += 1.0
-    steps = _ENDS if drift else _ENDS[-1:]
-    walk_information = np.eye(free) * PIECES / drift**2 if drift else np.zeros((free, free))
+    pieces = objective.problem.options.posterior.drift_pieces
+    steps = np.arange(1.0, pieces + 1.0) / pieces if drift else np.ones(1)
+    walk_information = np.eye(free) * pieces / drift**2 if drift else np.zeros((free, free))
     ends = np.searchsorted(ago, steps - 1.0, side="right").tolist()
     for begin, end in zip([0, *ends[:-1]], ends, strict=True):
         if begin:

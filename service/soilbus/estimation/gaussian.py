@@ -41,13 +41,6 @@ _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
 LINEAR = np.array([_K_C, _N, _PHI, _C])
 """Parameters in which forces, of n the logarithm of pressure, are linear, of phi in its tangent."""
-MIN_VARIANCE_REDUCTION = 1e-3
-"""Least share [1] of the prior variance of a linear parameter's logarithm that data are taken to remove.
-
-Keeps the likelihood factor finite where they remove none.  No evidence recorded.
-"""
-LEAST_VALUE_STEPS, LEAST_VALUE_TOLERANCE = 20, 1e-3
-"""Newton steps to the least -2 log prior, at most, and the length [1, of logarithms] below which they end."""
 
 
 def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
@@ -203,8 +196,9 @@ class Gaussian:
         """Free parameters of LINEAR, and the covariance (6 + G, 6 + G) without the priors of their logarithms."""
         free = LINEAR[prior.log_std[LINEAR] > 0.0]
         unit, along = prior.log_std[free], self.covariance[:, free]
+        # data that remove no variance leave a finite factor, too
         removed, axes = np.linalg.eigh(np.eye(len(free)) - along[free] / np.outer(unit, unit))
-        inverse = (axes / np.maximum(removed, MIN_VARIANCE_REDUCTION)) @ axes.T / np.outer(unit, unit)
+        inverse = (axes / np.maximum(removed, 1e-3)) @ axes.T / np.outer(unit, unit)
         return free, self.covariance + along @ inverse @ along.T
 
     def variance_of_k_c(self, prior: SoilPrior) -> float:
@@ -353,7 +347,7 @@ class PriorFactor:
         base, prior, linear = self._gaussian_prior.soil, self._prior, self._linear
         precision = np.linalg.inv(self._gaussian_prior.covariance[np.ix_(linear, linear)])
         of_prior, soil, least = prior.log_std[linear] ** -2, base.copy(), math.inf
-        for _ in range(LEAST_VALUE_STEPS):
+        for _ in range(20):  # two or three do
             changes, by_logs = deviations(soil, base, self._width)
             off, slopes = (changes - self._offset)[linear], by_logs[linear, linear]
             log = np.log(soil[linear] / prior.median[linear])
@@ -363,7 +357,7 @@ class PriorFactor:
             step = -np.linalg.solve(curved, slopes * weighted + of_prior * log)
             step *= min(1.0, 1.0 / float(np.abs(step).max()))
             soil[linear] *= np.exp(step)
-            if np.abs(step).max() < LEAST_VALUE_TOLERANCE:
+            if np.abs(step).max() < 1e-3:
                 break
         return least
 

@@ -36,31 +36,12 @@ from soilbus.arrays import Array, Indices
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit, fit_window, refine
 from soilbus.estimation.observation_model import DenoisedObservationModel, ObservationModel
-from soilbus.estimation.parametrization import BOUND_SD, Coordinates
+from soilbus.estimation.options import PosteriorOptions
+from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective
+from soilbus.estimation.solver import Iterate, Objective, coordinates_of
 from soilbus.terra.wheel import Soil
 
-DETERMINED_N_SD = 0.05
-"""Sd of log n [1] below which a posterior with one mode counts as Gaussian.  No evidence recorded."""
-MIN_LOAD_SIGNAL = 4.0
-"""Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1 all of
-it is noise, at 4 a quarter is."""
-FIRST_NODE_STEP = 0.1
-"""Longest first step of log n [1] from the mode.  No evidence recorded."""
-NODE_STEP_GROWTH = 1.4
-"""Ratio [1] of each step of log n to the one before.  No evidence recorded."""
-MAX_NODES = 12
-"""Nodes on either side of the mode.  No evidence recorded."""
-NEGLIGIBLE = 9.0
-"""-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
-GRID_POINTS = 400
-"""Values of n between the first and the last node that are averaged.  No evidence recorded."""
-ERROR_POWER, ERROR_POWER_OF_K_C = 1.0, 2.0
-"""Powers [1] of the attainable sd of a soil by which an error counts less there.
-
-With 2 the mean square error is least in units of what is attainable on each soil, with 0 that of the logarithm.
-"""
 _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 _OF_K_C, _OF_N = 0, 1
@@ -95,7 +76,7 @@ class ProfileOverN(NamedTuple):
     top
         Its fit with n free.
     nodes
-        In the order of n, on both sides down to where their density is NEGLIGIBLE.  Empty where k_c, k_phi and
+        In the order of n, on both sides down to where their density is negligible.  Empty where k_c, k_phi and
         n are not all free or all tyres have one width.
     """
 
@@ -107,7 +88,7 @@ class ProfileOverN(NamedTuple):
 def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior where its mode does not describe it.
 
-    That is where the sd of log n (`_sd_of_n`) exceeds DETERMINED_N_SD or there is a second mode.  There, and where
+    That is where the sd of log n (`_sd_of_n`) exceeds `determined_n_sd` or there is a second mode.  There, and where
     loads hardly vary, the noise of loads and speeds may have added false information on n or c, so the denoised window
     is fitted (`DenoisedObservationModel`).  Where k_c, k_phi and n are free and tyres differ in width, its posterior
     is averaged along n, unless n is determined.
@@ -125,22 +106,34 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         With `marginalised`, and with the denoised window's Gaussians unless there is a second mode; `found` itself
         where there is nothing to average.
     """
-    is_determined = _sd_of_n(problem, prior, joint_prior, found.mode) < DETERMINED_N_SD and found.second_mode is None
-    if is_determined and load_signal(problem, found) > MIN_LOAD_SIGNAL:
+    options = problem.options.posterior
+    sd_of_n = _sd_of_n(problem, prior, joint_prior, found.mode)
+    is_determined = sd_of_n < options.determined_n_sd and found.second_mode is None
+    if is_determined and load_signal(problem, found) > options.min_load_signal:
         return found
     with np.errstate(all="ignore"):
         along = profile_over_n(problem, prior, joint_prior, found, not is_determined)
         if along is None:
             return found
-        coordinates = Coordinates(prior, float(problem.rig.width.mean()))
+        coordinates = coordinates_of(problem, prior)
         attainable = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
-        averaged = (
-            along.top.mode if attainable is None else _averaged(along.nodes, attainable, coordinates, joint_prior)
-        )
+        averaged = along.top.mode
+        if attainable is not None:
+            averaged = _averaged(along.nodes, attainable, coordinates, joint_prior, options)
     is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
-    return replace(found, mode=along.top.mode, marginalised=averaged)
+    is_gaussian = _agree(along.top.mode, averaged, options)
+    return replace(found, mode=along.top.mode, marginalised=averaged, is_gaussian=is_gaussian)
+
+
+def _agree(mode: Gaussian, averaged: Gaussian, options: PosteriorOptions) -> bool:
+    """Whether the average along n is near to the Gaussian at the mode and hardly wider."""
+    free = np.flatnonzero(np.diag(mode.covariance) > 0.0)
+    own, wide = (b.covariance[np.ix_(free, free)] for b in (mode, averaged))
+    widening = np.linalg.eigvals(np.linalg.solve(own, wide)).real
+    shift = mode.posterior.distance(averaged.posterior.soil)
+    return bool(shift < options.gaussian_shift_sd and widening.max() < options.gaussian_widening**2)
 
 
 def _sd_of_n(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, mode: Gaussian) -> float:
@@ -188,7 +181,7 @@ def profile_over_n(
     first = _node(denoised, prior, joint_prior, top, math.log(top.mode.soil[_N]), None)
     if first is None:
         return ProfileOverN(denoised, top, [])
-    step = min(math.sqrt(top.mode.covariance[_N, _N]), FIRST_NODE_STEP)
+    step = min(math.sqrt(top.mode.covariance[_N, _N]), problem.options.posterior.first_node_step)
     covariance = top.mode.covariance
     slope = covariance[:, _N] / covariance[_N, _N]
     down, up = (_one_side(denoised, prior, joint_prior, first, slope, sign * step) for sign in (-1.0, 1.0))
@@ -217,8 +210,8 @@ def attainable_variance(along: ProfileOverN, prior: SoilPrior, joint_prior: Gaus
     return np.array(variance)
 
 
-def error_weights(probability: Array, attainable: Array) -> tuple[Array, Array]:
-    """Weights of M soils such that the weighted mean has the least error, by ERROR_POWER and ERROR_POWER_OF_K_C.
+def error_weights(probability: Array, attainable: Array, options: PosteriorOptions) -> tuple[Array, Array]:
+    """Weights of M soils such that the weighted mean has the least error.
 
     Parameters
     ----------
@@ -226,6 +219,8 @@ def error_weights(probability: Array, attainable: Array) -> tuple[Array, Array]:
         Of the soils.
     attainable : (M, 2)
         Variance of log k_c and log n that is attainable there.
+    options
+        With the powers of that sd by which an error counts.
 
     Returns
     -------
@@ -233,8 +228,8 @@ def error_weights(probability: Array, attainable: Array) -> tuple[Array, Array]:
         For all coordinates, by the variance of log n: combinations with n that the data determine stay so.
         For log k_c, by its own variance.
     """
-    of_all = probability * attainable[:, _OF_N] ** (-0.5 * ERROR_POWER)
-    of_k_c = probability * attainable[:, _OF_K_C] ** (-0.5 * ERROR_POWER_OF_K_C)
+    of_all = probability * attainable[:, _OF_N] ** (-0.5 * options.error_power)
+    of_k_c = probability * attainable[:, _OF_K_C] ** (-0.5 * options.error_power_of_k_c)
     return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
@@ -295,15 +290,12 @@ def _one_side(
     step is the first change of log n, with its sign.
     """
     nodes: list[Node] = []
-    last, least = top, top.neg2_log_density
-    for _ in range(MAX_NODES):
-        node = _node(problem, prior, joint_prior, last.fit, last.u + step, slope)
-        if node is None:
-            break
+    last, least, options = top, top.neg2_log_density, problem.options.posterior
+    while (node := _node(problem, prior, joint_prior, last.fit, last.u + step, slope)) is not None:
         nodes.append(node)
         slope = (_logs_and_gains(node.fit) - _logs_and_gains(last.fit)) / (node.u - last.u)
-        last, least, step = node, min(least, node.neg2_log_density), step * NODE_STEP_GROWTH
-        if node.neg2_log_density > least + NEGLIGIBLE:
+        last, least, step = node, min(least, node.neg2_log_density), step * options.node_step_growth
+        if node.neg2_log_density > least + options.negligible:
             break
     return nodes
 
@@ -313,12 +305,12 @@ def _node(
 ) -> Node | None:
     """The fit with log n held at u, from a fit nearby moved along the ridge; None beyond the bounds, or unconverged."""
     soil, gains, n = near.optimum.soil.copy(), near.optimum.gains, math.exp(u)
-    if abs(u - math.log(prior.median[_N])) > BOUND_SD * prior.log_std[_N]:
+    if abs(u - math.log(prior.median[_N])) > problem.options.search.bound_sd * prior.log_std[_N]:
         return None
     if slope is not None:
         predicted = _logs_and_gains(near) + slope * (u - math.log(soil[_N]))
         free = prior.log_std > 0.0
-        soil[free] = Coordinates(prior, float(problem.rig.width.mean())).within(np.exp(predicted[:_SOIL]))[free]
+        soil[free] = coordinates_of(problem, prior).within(np.exp(predicted[:_SOIL]))[free]
         gains = problem.allowed(predicted[_SOIL:])
     soil[_N] = n
     median, log_std = prior.median.copy(), prior.log_std.copy()
@@ -336,7 +328,9 @@ def _logs_and_gains(fit: Fit) -> Array:
     return np.concatenate([np.log(fit.optimum.soil), fit.optimum.gains])
 
 
-def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, joint_prior: Gaussian) -> Gaussian:
+def _averaged(
+    nodes: list[Node], attainable: Array, coordinates: Coordinates, joint_prior: Gaussian, options: PosteriorOptions
+) -> Gaussian:
     """Mean and covariance along n, from the nodes and linear interpolation between them.
 
     On the soils of one ridge a window's attainable sd, attainable (nodes, 2) as variance, differs by up to a
@@ -346,7 +340,7 @@ def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, jo
     active = _SOIL + np.flatnonzero(np.diag(joint_prior.covariance)[_SOIL:] > 0.0)
     gaussians = [node.fit.mode for node in nodes]
     u = np.array([node.u for node in nodes])
-    fine = np.linspace(u[0], u[-1], GRID_POINTS)
+    fine = np.linspace(u[0], u[-1], 400)
     by_density = density(u, np.array([node.neg2_log_density for node in nodes]), fine)
     by_confidence = confidence(u, np.array([node.neg2_log_profile for node in nodes]), fine)
     interpolation = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
@@ -358,7 +352,7 @@ def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, jo
     along = position.T @ interpolation
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in gaussians])
     probability = determined * by_confidence + (1.0 - determined) * by_density
-    of_all, of_k_c = error_weights(probability, interpolation.T @ attainable)
+    of_all, of_k_c = error_weights(probability, interpolation.T @ attainable, options)
     mean = along @ of_all
     mean[_K_C] = along[_K_C] @ of_k_c
     off = along - mean[:, None]

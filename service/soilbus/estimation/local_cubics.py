@@ -19,10 +19,8 @@ from soilbus.arrays import Array
 
 HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 """Numbers of samples on each side that are tried; with two a cubic averages at all."""
-GAP_STEPS = 1.5
-"""Distance of two samples, in median steps, above which they are in different runs; no evidence recorded."""
 PHASE_PARTS = 16
-"""Parts of a step to which phases are rounded for the variance; no evidence recorded."""
+"""Parts of a step to which phases are rounded for the variance, which is kept for each."""
 
 
 class Curve(NamedTuple):
@@ -118,7 +116,7 @@ def _curve(t: Array, value: Array, half: int) -> Curve:
     step = float(np.median(steps)) if len(steps) else 0.0
     slope = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
     unsmoothed = Curve(t, value, slope, np.zeros(len(t)), step, 0)
-    runs = np.split(np.arange(len(t)), np.flatnonzero(steps > GAP_STEPS * step) + 1)
+    runs = np.split(np.arange(len(t)), np.flatnonzero(steps > 1.5 * step) + 1)  # where a sample is missing
     runs = [run for run in runs if len(run) > 2 * half]
     if not half or 2 * sum(map(len, runs)) < len(t):
         return unsmoothed

@@ -1,6 +1,6 @@
 """Measurements of a window as the observation model uses them: usable instants, values, variances, masks.
 
-    slip_w = 1 - V / (r_w omega_w)                   usable where MIN_SLIP < slip < MAX_SLIP, load > 0, V > min_speed
+    slip_w = 1 - V / (r_w omega_w)                   usable where min_slip < slip < max_slip, load > 0, V > min_speed
     demand = draft + m (G sin(pitch) + dV/dt)        drawbar pull that the wheels must give, with its variance
 
 `Measurements` keeps the instants at which some wheel is usable: forward motion (`window.forward` mirrors reversing),
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import ROLLING_SLIP, completed
 from soilbus.estimation.local_cubics import Series
+from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -37,16 +38,6 @@ __all__ = [
 Masked = tuple[Array, Array, NDArray[np.bool_]]
 """Values, their variances, and a mask of which are known; zero where not."""
 
-MAX_SLIP = 0.98
-"""Slip from which a wheel is unusable; no evidence recorded."""
-MIN_SLIP = -1.0
-"""Slip (braking) up to which a wheel is unusable; no evidence recorded."""
-CUBIC_SELECTION_SD = 6.0
-"""Sd of the noise by which cubics must differ from lines to be used; no evidence recorded."""
-SUBSTITUTE_LOAD = 1e3
-"""Load [N] of unusable wheel-instants; their rows are zero, so it only has to be positive."""
-SUBSTITUTE_SPEED_RATIO = 0.8
-"""Ground speed over rim speed of unusable wheel-instants; their rows are zero, so it only has to be positive."""
 GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 """Quantities with a gain error, in the order of `gain_names`."""
 
@@ -101,7 +92,7 @@ class Measurements:
     """
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
-        self.rig = rig
+        self.rig, self.options = rig, rig.options
         self._curves = Curves(completed(forward(window), rig), rig.wheels)
         window = self._curves.window
         n_wheels = len(rig.wheels)
@@ -110,7 +101,8 @@ class Measurements:
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
-            turns = (rim_speed > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
+            turns = (rim_speed > 0.0) & (slip < self.options.measurements.max_slip)
+            turns &= slip > self.options.measurements.min_slip
             usable = straight[:, None] & (window.load > 0.0) & (turns | ~rig.drives)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
@@ -143,8 +135,9 @@ class Measurements:
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - ROLLING_SLIP)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
-        self.load = np.where(usable, load, SUBSTITUTE_LOAD)
-        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (SUBSTITUTE_SPEED_RATIO * rig.radius))
+        # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
+        self.load = np.where(usable, load, 1e3)
+        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
         self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
@@ -235,7 +228,9 @@ class Measurements:
             if has_acceleration.any() or self.rig.specific_force:
                 known = known & has_acceleration
             else:
-                acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
+                acceleration, acceleration_var = differentiated_speed(
+                    self.t, self.ground_speed, self.ground_speed_var, self.options.measurements
+                )
             inertia = mass * (GRAVITY * np.sin(pitch) + acceleration)
             inertia_var = mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
             self.pitch = pitch
@@ -338,13 +333,17 @@ def wheel_rotation(t: Array, speed: Array) -> Array:
     return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:
+def differentiated_speed(
+    t: Array, speed: Array, variance: Array, options: MeasurementOptions, half_width: int = 3
+) -> tuple[Array, Array]:
     """Acceleration and its variance as slopes of the ground speed, by local polynomials.
 
     Parameters
     ----------
     t, speed, variance : Array
         Times [s], ground speeds [m/s] and variances of these, (N,).
+    options : MeasurementOptions
+        By how much cubics must differ from lines to be used.
     half_width : int
         Samples on each side of a line.
 
@@ -369,7 +368,7 @@ def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: in
     difference = cubics.weights - np.pad(lines.weights, ((0, 0), (1, 1)))
     noise = float((difference**2 * variance[cubics.near]).sum())
     square = float(((cubics.value - lines.value) ** 2).sum())
-    use_cubics = square > noise * (1.0 + CUBIC_SELECTION_SD * math.sqrt(2.0 * (half_width + 1) / n))
+    use_cubics = square > noise * (1.0 + options.cubic_selection_sd * math.sqrt(2.0 * (half_width + 1) / n))
     chosen = cubics if use_cubics else lines
     return chosen.value, chosen.variance
 

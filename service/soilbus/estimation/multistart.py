@@ -33,14 +33,14 @@ from soilbus.estimation.observation_model import (
     ObservationModel,
     Optimum,
 )
+from soilbus.estimation.options import SearchOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
-from soilbus.estimation.solver import Iterate, Objective, Solution, SolverOptions, Termination, minimise
+from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, minimise
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
 __all__ = [
-    "COMPARED",
     "Fit",
     "SecondMode",
     "Start",
@@ -51,52 +51,6 @@ __all__ = [
 ]
 
 _K_C = PARAMETERS.index("k_c")
-
-SEARCH = SolverOptions(10, step_tolerance=1.0, decrease_tolerance=0.02, damping=1e-3, max_rise=0.0)
-"""Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
-COLD = SolverOptions()
-"""Joint descent of soil, gains and latents from there."""
-WARM = SolverOptions(step_tolerance=2e-4)
-"""Joint descent from near the optimum: of 382 windows of the golden recordings 9 in 10 end within 0.02 posterior sd of
-it, after 2 evaluations in the mean."""
-COMPARED = SolverOptions(step_tolerance=2e-2)
-"""Joint descent of fits that are compared by their objective: 0.02 of -2 log decides nothing."""
-THINNED = 24
-"""Instants of a window that the search for starts uses.  No evidence recorded."""
-MAX_KINDS = 2
-"""Soils of the table that the search starts from.  No evidence recorded."""
-AS_MEASURED_RATIO = 2.5
-"""The objective with latents as measured over that at the optimum [1], at most.  No evidence recorded."""
-MAX_JOINT_DESCENTS = 2
-"""Ends of the search from which all instants are fitted.  No evidence recorded."""
-MAX_IMPLAUSIBLE_EVALUATIONS = 5
-"""Evaluations from an end whose objective exceeds IMPLAUSIBLE.  No evidence recorded."""
-IMPLAUSIBLE = 60.0
-"""Objective per thinned instant [-2 log] above which a window cannot be of one soil.  No evidence recorded."""
-OTHER_OPTIMUM_SD = 10.0
-"""Posterior sd on a few instants [1] beyond which the end of a descent is another optimum.  No evidence recorded."""
-DISTINCT_SD = 2.0
-"""Mahalanobis distance [sd] of two optima from which they are two modes.  No evidence recorded."""
-GAUSSIAN_SHIFT_SD, GAUSSIAN_WIDENING = 0.5, 1.2
-"""How far the mean may be from the mode's [sd], and how much wider [1], for a posterior to count as Gaussian.
-
-No evidence recorded.
-"""
-MIN_MODE_SHARE = 0.05
-"""Share of the probability [1] below which a second mode does not count.  No evidence recorded."""
-PLAUSIBLE_CHI2 = 3.0
-"""Objective per residual [1] up to which an optimum of the search may be the soil's.  No evidence recorded."""
-DETERMINED_K_C_SD = 0.6
-"""Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it.
-
-No evidence recorded.
-"""
-SECOND_MODE_RATIO = 1.5
-"""Ratio of objectives on a few instants [1] above which an end is no second mode.  No evidence recorded."""
-SAME_END_RATIO = 0.02
-"""Relative difference of two objectives [1] below which two descents have met.  No evidence recorded."""
-START_PRIOR_SD = 2.0
-"""How far a start may be from the prior's median [prior sd].  No evidence recorded."""
 
 
 class Start(NamedTuple):
@@ -162,6 +116,8 @@ class Fit:
         Whether sinkages and the other measurements agree on no soil (see `tracker.sinkages_off_scale`).
     form
         What the model's form leaves open (`model_form`).
+    is_gaussian
+        Whether one mode describes the posterior; only then can it be the prior of later windows.
     """
 
     mode: Gaussian
@@ -177,6 +133,7 @@ class Fit:
     curved_path: CurvedPathFit | None = None
     off_scale: bool = False
     form: FormPosterior | None = None
+    is_gaussian: bool = True
 
     @property
     def posterior(self) -> Posterior:
@@ -191,17 +148,6 @@ class Fit:
         if self.second_mode is None:
             return self.mode
         return self.mode.mixture(self.second_mode.gaussian, self.second_mode.share)
-
-    @property
-    def is_gaussian(self) -> bool:
-        """Whether one mode describes the posterior; only then can it be the prior of later windows."""
-        if self.marginalised is None or self.second_mode is not None:
-            return self.second_mode is None
-        free = np.flatnonzero(np.diag(self.mode.covariance) > 0.0)
-        own, averaged = (b.covariance[np.ix_(free, free)] for b in (self.mode, self.marginalised))
-        widening = np.linalg.eigvals(np.linalg.solve(own, averaged)).real
-        shift = self.mode.posterior.distance(self.marginalised.posterior.soil)
-        return bool(shift < GAUSSIAN_SHIFT_SD and widening.max() < GAUSSIAN_WIDENING**2)
 
     @property
     def converged(self) -> bool:
@@ -237,16 +183,16 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
         None if no descent ends at a finite optimum.
     """
     joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
-    objective = Objective(problem, prior, joint_prior)
-    thin = Objective(problem.thinned(THINNED), prior, joint_prior, as_measured=True)
+    options, objective = problem.options.search, Objective(problem, prior, joint_prior)
+    thin = Objective(problem.thinned(options.thinned), prior, joint_prior, as_measured=True)
     with np.errstate(all="ignore"):
         ends = _search(thin)
-        best, origin = _best(objective, ends)
-        if best is None or best.chi2 > PLAUSIBLE_CHI2:
+        best = _joint_fit(objective, ends[0]) if ends else None
+        if best is None or best.chi2 > options.plausible_chi2:
             return best
         if not best.converged:
             return refit_denoised(objective, best)
-        return _with_second_mode(objective, thin, best, ends, origin)
+        return _with_second_mode(objective, thin, best, ends)
 
 
 def fit_from_soil(
@@ -263,15 +209,20 @@ def fit_from_soil(
         None where the numbers are not finite.
     """
     joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
-    soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
+    soil, options = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median), problem.options.search
     with np.errstate(all="ignore"):
         as_measured = Objective(problem, prior, joint_prior, as_measured=True)
-        near = minimise(as_measured, as_measured.start(soil), replace(SEARCH, max_evaluations=COLD.max_evaluations))
+        alone = replace(options.soil_alone, max_evaluations=options.cold.max_evaluations)
+        near = minimise(as_measured, as_measured.start(soil), alone)
         return _cold_fit(Objective(problem, prior, joint_prior), near)
 
 
 def fit_from(
-    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, start: Start, options: SolverOptions = COMPARED
+    problem: ObservationModel,
+    prior: SoilPrior,
+    joint_prior: Gaussian,
+    start: Start,
+    options: SolverOptions,
 ) -> Fit | None:
     """Fit from a given start, to be compared with others by its objective.
 
@@ -290,7 +241,7 @@ def fit_from(
     Fit or None
         None where the numbers are not finite, or where the fit stays above `give_up_above`.
     """
-    objective = Objective(problem, prior, joint_prior)
+    search, objective = problem.options.search, Objective(problem, prior, joint_prior)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near_optimum:
@@ -298,9 +249,9 @@ def fit_from(
         else:
             as_measured = Objective(problem, prior, joint_prior, as_measured=True)
             first = replace(
-                SEARCH,
+                search.soil_alone,
                 max_evaluations=options.max_evaluations // 2,
-                give_up_above=AS_MEASURED_RATIO * options.give_up_above,
+                give_up_above=search.as_measured_ratio * options.give_up_above,
             )
             near = minimise(as_measured, as_measured.start(start.soil, gains=gains), first)
             if near.termination in (Termination.GIVEN_UP, Termination.NOT_FINITE):
@@ -339,12 +290,16 @@ def fit_warm(start: WarmStart) -> Fit | None:
         if model is None or step is None:
             return None
         near = objective.stepped(iterate, model, step)
-        return fit_at(objective, minimise(objective, near, WARM, model.squared_length(step)), evaluations=1)
+        return fit_at(
+            objective,
+            minimise(objective, near, objective.options.warm, model.squared_length(step)),
+            evaluations=1,
+        )
 
 
 def refine(objective: Objective, start: Iterate) -> Fit | None:
     """Fit from near the optimum; None where the numbers are not finite."""
-    return fit_at(objective, minimise(objective, start, WARM, 0.0))
+    return fit_at(objective, minimise(objective, start, objective.options.warm, 0.0))
 
 
 def refit_denoised(objective: Objective, fit: Fit) -> Fit:
@@ -358,9 +313,9 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
     Returns
     -------
     Fit
-        The fit itself where its chi2 exceeds PLAUSIBLE_CHI2 or no such optimum is found.
+        The fit itself where its chi2 exceeds `plausible_chi2` or no such optimum is found.
     """
-    if not fit.chi2 < PLAUSIBLE_CHI2:
+    if not fit.chi2 < objective.options.plausible_chi2:
         return fit
     optimum = fit.optimum
     with np.errstate(all="ignore"):
@@ -388,20 +343,23 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
 
 
 def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
-    """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, further ones of the table.
+    """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, the second likeliest.
 
     See `soil_classes.ranked_by_likelihood`.
     """
+    options = problem.options.search
     yield Soil(*(prior.median if joint_prior is None else joint_prior.soil).tolist())
-    likeliest, *others = ranked_by_likelihood(problem, [clip_to_prior(prior, SOILS[kind]) for kind in KINDS])
+    likeliest, second, *_ = ranked_by_likelihood(
+        problem, [clip_to_prior(prior, SOILS[kind], options) for kind in KINDS]
+    )
     yield likeliest
-    yield clip_to_prior(prior, SOILS["loam"])
-    yield from others[: MAX_KINDS - 1]
+    yield clip_to_prior(prior, SOILS["loam"], options)
+    yield second
 
 
-def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
-    """The soil with held parameters at their values and the others within START_PRIOR_SD of the prior's median."""
-    factor = np.exp(START_PRIOR_SD * prior.log_std)
+def clip_to_prior(prior: SoilPrior, soil: Soil, options: SearchOptions) -> Soil:
+    """The soil with held parameters at their values and the others within `start_prior_sd` of the prior's median."""
+    factor = np.exp(options.start_prior_sd * prior.log_std)
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
 
@@ -410,14 +368,14 @@ def _search(thin: Objective) -> list[_End]:
 
     Descents from the starts in turn; two that meet at a plausible objective end the search.
     """
-    ends: list[_End] = []
+    options, ends = thin.options, list[_End]()
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
         end = _end_from(thin, np.asarray(start))
         if end is None:
             continue
-        met = any(abs(end.value - other.value) < SAME_END_RATIO * other.value for other in ends)
+        met = any(abs(end.value - other.value) < options.same_end_ratio * other.value for other in ends)
         ends.append(end)
-        if met and end.value < PLAUSIBLE_CHI2 * thin.problem.n_rows:
+        if met and end.value < options.plausible_chi2 * thin.problem.n_rows:
             break
     return sorted(ends, key=lambda end: end.value)
 
@@ -433,59 +391,48 @@ class _End(NamedTuple):
 
 def _end_from(thin: Objective, soil: Array) -> _End | None:
     """The end of a descent on a few instants from a soil (6,); None where the numbers are not finite."""
-    end = minimise(thin, thin.start(soil), SEARCH)
+    end = minimise(thin, thin.start(soil), thin.options.soil_alone)
     if end.model is None:
         return None
     return _End(end.previous.soil, end.previous.gains, end.model.neg2_log_posterior, end.evaluations)
 
 
-def _best(objective: Objective, ends: Sequence[_End]) -> tuple[Fit | None, _End | None]:
-    """The first fit that converges from the distinct ends of the search, else the best, and the end it started from."""
-    distinct = [end for i, end in enumerate(ends) if i == 0 or end.value > ends[i - 1].value * (1.0 + SAME_END_RATIO)]
-    best, origin = None, None
-    for end in distinct[:MAX_JOINT_DESCENTS]:
-        is_plausible = end.value < IMPLAUSIBLE * THINNED
-        options = COLD if is_plausible else replace(COLD, max_evaluations=MAX_IMPLAUSIBLE_EVALUATIONS)
-        fit = fit_at(
-            objective, minimise(objective, objective.start(end.soil, gains=end.gains), options), end.evaluations
-        )
-        if fit is not None and (
-            best is None or (fit.converged, -fit.neg2_log_posterior) > (best.converged, -best.neg2_log_posterior)
-        ):
-            best, origin = fit, end
-        if best is not None and best.converged:
-            break
-    return best, origin
+def _joint_fit(objective: Objective, end: _End) -> Fit | None:
+    """The fit to all instants from an end of the search; None where the numbers are not finite."""
+    options, start = objective.options, objective.start(end.soil, gains=end.gains)
+    descent = options.cold
+    if not end.value < options.implausible * options.thinned:
+        descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
+    return fit_at(objective, minimise(objective, start, descent), end.evaluations)
 
 
-def _with_second_mode(
-    objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End], origin: _End | None
-) -> Fit:
+def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> Fit:
     """The likelier of an optimum and another one, with the other as its second mode.
 
-    The candidate is an end of the search other than `origin`, from which `found` was reached, or the soil
-    with k_c's other share.  There is no second mode where its share of the probability is below MIN_MODE_SHARE
-    or the two are less than DISTINCT_SD apart.
+    The candidate is an end of the search other than the first, from which `found` was reached, or the soil
+    with k_c's other share.  There is no second mode where its share of the probability is below `min_mode_share`
+    or the two are less than `distinct_sd` apart.
     """
+    options = objective.options
     has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
-    end = _other_end(objective, thin, found, ends, origin) if has_two_widths else None
+    end = _other_end(objective, thin, found, ends) if has_two_widths else None
     if end is None:
         return found
-    other = fit_at(objective, minimise(objective, objective.start(end.soil, gains=end.gains), COLD))
+    other = _joint_fit(objective, end)
     if other is None or not other.converged:
         return found
     better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
     share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.neg2_log_evidence - better.neg2_log_evidence), 50.0)))
-    if share < MIN_MODE_SHARE or better.mode.posterior.distance(worse.mode.posterior.soil) < DISTINCT_SD:
+    is_distinct = better.mode.posterior.distance(worse.mode.posterior.soil) >= options.distinct_sd
+    if share < options.min_mode_share or not is_distinct:
         return better
-    return replace(better, second_mode=SecondMode(worse.mode, share))
+    return replace(better, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
 
 
-def _other_end(
-    objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End], origin: _End | None
-) -> _End | None:
-    """The end of a descent on a few instants that is about as low as `found` there, and far from it."""
-    is_k_c_open = math.sqrt(found.mode.covariance[_K_C, _K_C]) > DETERMINED_K_C_SD
+def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:
+    """The best end of a descent on a few instants that is far from `found`."""
+    options = objective.options
+    is_k_c_open = math.sqrt(found.mode.covariance[_K_C, _K_C]) > options.determined_k_c_sd
     has_several_ends = len({end.soil.tobytes() for end in ends}) > 1
     here = thin.quadratic_model(thin.start(found.mode.soil)) if has_several_ends or is_k_c_open else None
     if here is None:
@@ -497,29 +444,21 @@ def _other_end(
         off[: len(position)] = thin.coordinates.position(end.soil) - position
         return here.squared_length(off)
 
-    def is_elsewhere(end: _End) -> bool:
-        is_low = end.value < SECOND_MODE_RATIO * here.neg2_log_posterior
-        return is_low and squared_distance(end) > OTHER_OPTIMUM_SD**2
-
-    def is_origin(end: _End) -> bool:
-        return origin is not None and np.array_equal(end.soil, origin.soil)
-
-    nearest = min(map(squared_distance, ends))
-    other = next(
-        (end for end in ends if is_elsewhere(end) and squared_distance(end) > nearest and not is_origin(end)), None
-    )
+    away = options.other_optimum_sd**2
+    least = max(away, min(map(squared_distance, ends)))
+    other = next((end for end in ends[1:] if squared_distance(end) > least), None)
     start = objective.coordinates.with_other_share(found.mode.soil) if is_k_c_open and other is None else None
     if start is None:
         return other
     end = _end_from(thin, start)
-    return end if end is not None and is_elsewhere(end) else None
+    return end if end is not None and squared_distance(end) > away else None
 
 
 def _cold_fit(objective: Objective, near: Solution) -> Fit | None:
     """The fit by a joint descent from where one with latents as measured ended; None where it is not finite."""
     if near.model is None:
         return None
-    return fit_at(objective, minimise(objective, near.previous, COLD), near.evaluations)
+    return fit_at(objective, minimise(objective, near.previous, objective.options.cold), near.evaluations)
 
 
 def fit_at(objective: Objective, end: Solution, evaluations: int = 0) -> Fit | None:

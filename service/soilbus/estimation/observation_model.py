@@ -66,24 +66,8 @@ SOIL = slice(1, 1 + len(Soil._fields))
 """Columns with the derivatives by the soil parameters."""
 FIRST_GAIN = SOIL.stop
 """Column of the first nuisance parameter: the sensor gains, then the effect parameters."""
-MAX_TURN = 0.15
-"""Default relative difference of an axle's rim speeds above which slip is not used; no evidence recorded."""
-START_LOAD_TOLERANCE = 0.02
-"""Relative error of load accepted in the first entry angles; each linearisation reduces it further."""
-MAX_LOAD_ITERATIONS = 6
-"""Secant steps to the entry angles that carry the loads under effects; no evidence recorded."""
-ENTRY_ANGLE_TOLERANCE = 0.01
-"""Relative step of an entry angle after which these steps end; no evidence recorded."""
-MAX_ROLLING_SKID, MAX_ROLLING_STEP = 0.5, 0.05
-"""Largest skid (minus slip) of a free wheel, as in the capability, and the largest change of it in one step: its torque
-is curved within K over the contact's length of zero."""
-ROLLING_ROUNDS = 4
-"""Newton steps to the first slips of free wheels; each linearisation adds one."""
 TIME_TOLERANCE = 1e-3
 """Times [s] closer than this are those of one bin."""
-FORM_STRIDE = 4
-"""One instant of this many gets derivatives by the form parameters, which are smooth in loads and slips: linear
-interpolation between them changes no sd of the soil by more than 3 %."""
 _TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
 """Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
 _DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
@@ -360,7 +344,7 @@ class ObservationModel(Measurements):
     min_speed : float
         Ground speed [m/s] up to which instants are left out.
     max_turn : float
-        Relative difference of an axle's rim speeds above which instants are left out.
+        Relative difference of an axle's rim speeds above which instants are left out; as in `config.model.Estimator`.
 
     Notes
     -----
@@ -368,9 +352,7 @@ class ObservationModel(Measurements):
     in the order of `gain_names`, then the effect parameters.  `work` counts evaluations.
     """
 
-    def __init__(
-        self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = MAX_TURN
-    ) -> None:
+    def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = 0.15) -> None:
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
         self.work = Work()
@@ -538,9 +520,9 @@ class ObservationModel(Measurements):
         rim = self.rig.radius[free] * latents.speed[:, free]
         ratio = latents.ground_speed[:, None] / rim  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        step = np.where(by_slip > 0.0, -at.value[1][:, free] / np.where(by_slip > 0.0, by_slip, 1.0), -MAX_ROLLING_STEP)
-        slip = 1.0 - ratio + np.clip(step, -MAX_ROLLING_STEP, MAX_ROLLING_STEP)
-        return np.asarray(np.clip(slip, -MAX_ROLLING_SKID, 0.0))
+        limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
+        step = np.where(by_slip > 0.0, -at.value[1][:, free] / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
+        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -0.5, 0.0))
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
@@ -750,7 +732,9 @@ class ObservationModel(Measurements):
         """Derivatives (R, 4) of the residuals by `model_form.FORM` at an optimum, and these weighed by S^-1."""
         soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
         layout, (n, m) = self.layout, at.by_latents.shape[:2]
-        instants = np.unique(np.linspace(0, n - 1, math.ceil(n / FORM_STRIDE)).round().astype(int))
+        instants = np.unique(
+            np.linspace(0, n - 1, math.ceil(n / self.options.posterior.form_stride)).round().astype(int)
+        )
         sparse = self.part(instants)._contact_by_form(soil, gains, latents.part(instants))
         by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
@@ -808,7 +792,8 @@ class ObservationModel(Measurements):
         """The same latents with the entry angles at which this soil carries their loads at gains (G,)."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         state = self._state(soil, latents.entry_angle, slip)
-        angle = entry_angle_for_load(latents.load.ravel(), state, self.model, tolerance=START_LOAD_TOLERANCE)
+        tolerance = self.options.measurements.load_tolerance
+        angle = entry_angle_for_load(latents.load.ravel(), state, self.model, tolerance=tolerance)
         angle = angle.reshape(self.n, self.n_wheels)
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
         solved = Latents(latents.load, latents.speed, latents.ground_speed, angle)
@@ -817,7 +802,7 @@ class ObservationModel(Measurements):
     def _rolled(self, latents: Latents, soil: Soil) -> Latents:
         """The latents with the speeds and entry angles at which the free wheels need no torque, nearly."""
         free, no_gains = self.rolls, np.zeros(self.n_sensors)
-        for _ in range(ROLLING_ROUNDS):
+        for _ in range(4):  # each linearisation adds one
             at = ObservationModel._response(self, soil, no_gains, latents)
             slip, speed, angle = self._rolling_slip(at, latents), latents.speed.copy(), latents.entry_angle.copy()
             before = 1.0 - latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])
@@ -899,7 +884,7 @@ class ObservationModelWithEffects(ObservationModel):
         rig: Rig,
         model: WheelModel,
         min_speed: float,
-        max_turn: float = MAX_TURN,
+        max_turn: float = 0.15,
         effects: Sequence[Effect] = (),
         free: Sequence[Free] = (),
     ) -> None:
@@ -1185,10 +1170,10 @@ class ObservationModelWithEffects(ObservationModel):
         off = excess(angle)
         with np.errstate(all="ignore"):
             slope = (2.0 * soil.n + 1.0) * base.load  # by the angle's logarithm, for small angles; then secants
-            for _ in range(MAX_LOAD_ITERATIONS):
+            for _ in range(6):
                 step = np.where(slope > 0.0, -off / slope, 0.0)
                 new_angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
-                if np.abs(step).max(initial=0.0) < ENTRY_ANGLE_TOLERANCE:
+                if np.abs(step).max(initial=0.0) < 0.01:
                     angle = new_angle
                     break
                 new_excess = excess(new_angle)

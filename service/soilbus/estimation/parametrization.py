@@ -3,7 +3,7 @@
 Equations.  With b the mean tyre width, z the typical depth, and K_L = k_c / b + k_phi,
 
     coordinates    log k_c, log (K_L z^n), log n, log phi, log c, log K        (free parameters only)
-    bounds         |log parameter - log prior median| <= BOUND_SD prior sd,   phi <= MAX_PHI
+    bounds         |log parameter - log prior median| <= bound_sd prior sd,   phi <= MAX_PHI
 
 A window determines the bearing pressure K_L z^n well and k_c, k_phi and n apart badly.  In plain logarithms
 the optimum would lie in a long curved valley; with log pressure in the place of log k_phi it does not.
@@ -12,33 +12,21 @@ the optimum would lie in a long curved valley; with log pressure in the place of
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.estimation.options import SearchOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 
-TYPICAL_DEPTH = 0.03
-"""Sinkage [m] at which the bearing pressure is a coordinate.  No evidence recorded."""
-MAX_LOG_STEP = 0.7
-"""Longest step of a coordinate [1, a logarithm]: a factor of two.  No evidence recorded."""
-MIN_TAN_RATIO = 0.2
-"""Least ratio [1] of tan phi after a step to that before."""
-BOUND_SD = 4.0
-"""Bound of a free parameter's logarithm about the prior median [prior sd].  No evidence recorded."""
 BOUND_TOLERANCE = 1e-4
 """Distance within which a parameter is at its bound [1: of a logarithm, or in sd of an effect's parameter]."""
-LOW_SHARE, HIGH_SHARE = 0.03, 0.4
-"""Shares of k_c in K_L [1] on either side of what most windows can distinguish from zero.  No evidence recorded."""
 MAX_PHI = 1.2
 """Largest free friction angle [rad], beyond any soil's: the model ends at a right angle."""
-MIN_K_PHI_SHARE = 0.01
-"""Least share of k_phi in K_L [1] that coordinates are converted to: k_phi is positive."""
 
-_LOG_DEPTH = math.log(TYPICAL_DEPTH)
 _K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
 
 
@@ -52,10 +40,18 @@ class Coordinates:
         Decides which parameters are free, the values of the others, and the bounds.
     width
         Mean tyre width [m].
+    options
+        Typical depth, bounds, limits of a step.
     """
 
     prior: SoilPrior
     width: float
+    options: SearchOptions = field(default_factory=SearchOptions)
+
+    @cached_property
+    def log_depth(self) -> float:
+        """Logarithm of the typical depth [m]."""
+        return math.log(self.options.typical_depth)
 
     @cached_property
     def free(self) -> NDArray[np.intp]:
@@ -67,7 +63,7 @@ class Coordinates:
         logs = np.log(soil[self.free])
         if _K_PHI in self._column:
             k_c, k_phi, n = soil[:3].tolist()
-            logs[self._column[_K_PHI]] = math.log(k_phi + k_c / self.width) + n * _LOG_DEPTH
+            logs[self._column[_K_PHI]] = math.log(k_phi + k_c / self.width) + n * self.log_depth
         return logs
 
     def soil_at(self, position: Array) -> Array:
@@ -76,8 +72,8 @@ class Coordinates:
         soil = self.prior.median.copy()
         soil[free] = np.exp(position)
         if _K_PHI in self._column:
-            K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * _LOG_DEPTH)
-            soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, MIN_K_PHI_SHARE * K_L)
+            K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * self.log_depth)
+            soil[_K_PHI] = K_L - soil[_K_C] / self.width
         return self.within(soil)
 
     def log_directions(self, soil: Array) -> Array:
@@ -93,7 +89,7 @@ class Coordinates:
             if _K_C in column:
                 directions[_K_PHI, column[_K_C]] = -k_c / self.width / k_phi
             if _N in column:
-                directions[_K_PHI, column[_N]] = -K_L / k_phi * n * _LOG_DEPTH
+                directions[_K_PHI, column[_N]] = -K_L / k_phi * n * self.log_depth
         directions.flags.writeable = False
         self._last_directions[:] = soil, directions
         return directions
@@ -118,23 +114,23 @@ class Coordinates:
         return curvature
 
     def stepped(self, soil: Array, step: Array) -> Array:
-        """The soil (6,) after a step (F,), which is shortened to MAX_LOG_STEP.
+        """The soil (6,) after a step (F,), which is shortened to `max_log_step`.
 
         c and tan phi change linearly: along c + p tan phi, which a window at one pressure p measures alone, a step in
         logarithms would leave the valley.
         """
-        step = step * min(1.0, MAX_LOG_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
+        step = step * min(1.0, self.options.max_log_step / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
         new = self.soil_at(self.position(soil) + step)
         if _C in self._column:
             new[_C] = soil[_C] * (1.0 + step[self._column[_C]])
         if _PHI in self._column:
             phi, tan = float(soil[_PHI]), math.tan(soil[_PHI])
             change = phi * (1.0 + tan**2) * float(step[self._column[_PHI]])
-            new[_PHI] = math.atan(max(tan + change, MIN_TAN_RATIO * tan))
+            new[_PHI] = math.atan(tan + change)
         return self.within(new)
 
     def step_fraction(self, soil: Array, step: Array) -> float:
-        """Fraction of a step (F,) from a soil (6,) within the bounds and MAX_LOG_STEP, 1 at most."""
+        """Fraction of a step (F,) from a soil (6,) within the bounds and `max_log_step`, 1 at most."""
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
@@ -144,7 +140,7 @@ class Coordinates:
             column, tan = self._column[_PHI], math.tan(soil[_PHI])
             bound = math.tan(soil[_PHI] * math.exp(room[column]))
             room[column] = (bound - tan) / (soil[_PHI] * (1.0 + tan**2))
-        longest = MAX_LOG_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
+        longest = self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
 
     def within(self, soil: Array) -> Array:
@@ -176,8 +172,8 @@ class Coordinates:
         if not {_K_C, _K_PHI} <= self._column.keys():
             return None
         K_L = soil[_K_PHI] + soil[_K_C] / self.width
-        is_high = soil[_K_C] / self.width > math.sqrt(LOW_SHARE * HIGH_SHARE) * K_L
-        share = LOW_SHARE if is_high else HIGH_SHARE
+        low, high = 0.03, 0.4  # on either side of what most windows can distinguish from zero
+        share = low if soil[_K_C] / self.width > math.sqrt(low * high) * K_L else high
         other = soil.copy()
         other[_K_C], other[_K_PHI] = share * K_L * self.width, (1.0 - share) * K_L
         return self.within(other)
@@ -185,7 +181,7 @@ class Coordinates:
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
         """Least and greatest values (F,) of the free parameters, in SI."""
-        centre, factor = self.prior.median[self.free], np.exp(BOUND_SD * self.prior.log_std[self.free])
+        centre, factor = self.prior.median[self.free], np.exp(self.options.bound_sd * self.prior.log_std[self.free])
         most = np.where(self.free == _PHI, MAX_PHI, np.inf)
         return centre / factor, np.minimum(centre * factor, most)
 

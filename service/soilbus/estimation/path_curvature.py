@@ -32,10 +32,6 @@ from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import Rig, Window, pairs
 
-KNOT_SPACING = 1.0
-"""Time [s] between two knots of the curvature; no evidence recorded."""
-MIN_CURVATURE_GAIN = 25.0
-"""Fall of -2 log posterior from which curvature at knots is accepted; noise alone makes about 9 in a window of 10 s."""
 _SOIL = len(PARAMETERS)
 
 
@@ -96,7 +92,7 @@ def without_curvature(gaussian: Gaussian, curvature: PathCurvature) -> Gaussian:
 
 
 def detected_curvature(objective: Objective, fit: Fit | None) -> CurvedPath | None:
-    """Path curvature at knots, if it lowers -2 log posterior by more than `MIN_CURVATURE_GAIN`.
+    """Path curvature at knots, if it lowers -2 log posterior by more than `min_curvature_gain`.
 
     Parameters
     ----------
@@ -126,10 +122,10 @@ def detected_curvature(objective: Objective, fit: Fit | None) -> CurvedPath | No
     information = basis.T @ (own[:, None] * basis) - of_information + np.eye(len(std))
     amplitude = -np.linalg.solve(information, gradient)
     fall = -float(gradient @ amplitude)
-    if not fall > MIN_CURVATURE_GAIN:
+    if not fall > problem.options.posterior.min_curvature_gain:
         return None
     occam = float(np.linalg.slogdet(information)[1])
-    return CurvedPath(knots_of(optimum.t), amplitude * std, float(amplitude @ amplitude), occam)
+    return CurvedPath(knots_of(problem), amplitude * std, float(amplitude @ amplitude), occam)
 
 
 def straightened(window: Window, rig: Rig, path: CurvedPath) -> Window:
@@ -187,7 +183,8 @@ def by_curvature(objective: Objective, fit: Fit) -> tuple[Array, Array]:
 
 def curvature_basis(measurements: Measurements) -> tuple[Array, Array]:
     """Prior sd (K,) of the curvature at each knot, by the rim speeds near it and in all; hats (N, K) times it."""
-    hats = np.maximum(1.0 - np.abs(measurements.t[:, None] - knots_of(measurements.t)) / KNOT_SPACING, 0.0)
+    away = np.abs(measurements.t[:, None] - knots_of(measurements))
+    hats = np.maximum(1.0 - away / measurements.options.posterior.knot_spacing, 0.0)
     differences = rim_differences(measurements)
     known = np.isfinite(differences)
     near = (hats > 0.0) & known[:, None]
@@ -196,10 +193,11 @@ def curvature_basis(measurements: Measurements) -> tuple[Array, Array]:
     return std, hats * std
 
 
-def knots_of(t: Array) -> Array:
-    """Times (K,) [s] of the knots for instants t (N,) [s], counted back from the last."""
-    count = math.ceil((t[-1] - t[0]) / KNOT_SPACING - 1e-6)
-    return np.asarray(t[-1] - KNOT_SPACING * np.arange(count, -1, -1))
+def knots_of(measurements: Measurements) -> Array:
+    """Times (K,) [s] of the knots for a window, counted back from its last instant."""
+    t, spacing = measurements.t, measurements.options.posterior.knot_spacing
+    count = math.ceil((t[-1] - t[0]) / spacing - 1e-6)
+    return np.asarray(t[-1] - spacing * np.arange(count, -1, -1))
 
 
 def sides(rig: Rig) -> Array:

@@ -46,17 +46,6 @@ table for one snow differ by 1.4 times these sds: phi 0.12, c 0.36, pressure 0.1
 Within a field: phi up to 12 %, strength 20 to 40 % (Phoon & Kulhawy 1999, Can. Geotech. J.
 36:612).  K is no part of Wong's table: planning figures, right to half of themselves.
 """
-MIN_INFORMATION = 1e-3
-"""Information, times the variance of `unknown` [1], below which a direction counts as not measured.
-
-No evidence recorded.
-"""
-RANKING_INSTANTS = 6
-"""Instants of a window by which soils of the table are ranked.  No evidence recorded."""
-RANKING_RELATIVE_SD = 0.1
-"""Relative sd of torque, pull and sinkage about those of a soil of the table [1]: a field is not the table's."""
-NO_GUESS_LOG_SD = 1e3
-"""Sd of a logarithm [1] that stands for a parameter without a guess."""
 
 _K_C = PARAMETERS.index("k_c")
 
@@ -128,7 +117,7 @@ def guessed(prior: SoilPrior, default: SoilPrior) -> SoilPrior:
     Where it differs, somebody who knows the field has set it.
     """
     is_default = (prior.median == default.median) & (prior.log_std == default.log_std)
-    return SoilPrior(prior.median, np.where(is_default, prior.log_std, NO_GUESS_LOG_SD))
+    return SoilPrior(prior.median, np.where(is_default, prior.log_std, 1e3))
 
 
 @dataclass(frozen=True)
@@ -164,7 +153,7 @@ def _evidence(posterior: Posterior, guess: SoilPrior, width: float, scale: Array
     of_guess = information(np.diag(guess.log_std[free] ** 2))
     strength, direction = np.linalg.eigh(of_posterior - of_guess)
     information_mean = of_posterior @ (here[counted] / scale) - of_guess @ (centre[counted] / scale)
-    is_measured = strength > MIN_INFORMATION
+    is_measured = strength > 1e-3  # of the prior of `unknown`: less decides nothing
     strength, direction = strength[is_measured], direction[:, is_measured].T
     return _Evidence(free[counted], direction / scale, direction @ information_mean / strength, 1.0 / strength)
 
@@ -175,30 +164,26 @@ def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> li
     Parameters
     ----------
     problem
-        A window; RANKING_INSTANTS of it are used, with loads and slips as measured.
+        A window; six instants of it are used, with loads and slips as measured.
     soils
         In SI.
 
     Notes
     -----
     The misfit is the sum of squares of predicted less measured torque, pull and sinkage over
-    RANKING_RELATIVE_SD of their size.
+    a tenth of their size: a field is not the table's.
     """
-    few = problem.thinned(RANKING_INSTANTS)
+    few, sd = problem.thinned(6), 0.1
     radius, shape = few.rig.radius, (len(soils), *few.load.shape)
     each = Soil(*np.array(soils).T[:, :, None, None])
     slip = np.broadcast_to(np.where(few.usable, few.slip, 0.0), shape)
     state = state_on(each, np.nan, slip, radius, few.rig.width, few.rig.length)
-    angle = entry_angle_for_load(np.broadcast_to(few.load, shape), state, few.model, tolerance=RANKING_RELATIVE_SD**2)
+    angle = entry_angle_for_load(np.broadcast_to(few.load, shape), state, few.model, tolerance=sd**2)
     _, pull, torque = wheel_forces(state._replace(entry_angle=angle), few.model)
     depth = sinkage(angle, radius)
     typical = np.abs(few.torque).sum() / max(np.count_nonzero(few.has_torque), 1) + 1.0
-    by_torque = np.where(few.has_torque, few.torque_rows(torque) - few.torque, 0.0) / (RANKING_RELATIVE_SD * typical)
-    by_pull = np.where(few.has_balance, pull.sum(axis=2) - few.demand, 0.0) / (
-        RANKING_RELATIVE_SD * typical * (1.0 / radius).sum()
-    )
-    by_depth = np.where(few.has_sinkage, depth - few.sinkage, 0.0) / (
-        RANKING_RELATIVE_SD * depth + np.sqrt(few.sinkage_var)
-    )
+    by_torque = np.where(few.has_torque, few.torque_rows(torque) - few.torque, 0.0) / (sd * typical)
+    by_pull = np.where(few.has_balance, pull.sum(axis=2) - few.demand, 0.0) / (sd * typical * (1.0 / radius).sum())
+    by_depth = np.where(few.has_sinkage, depth - few.sinkage, 0.0) / (sd * depth + np.sqrt(few.sinkage_var))
     misfit = (by_torque**2).sum((1, 2)) + (by_pull**2).sum(1) + (by_depth**2).sum((1, 2))
     return [soils[i] for i in np.argsort(np.where(np.isfinite(misfit), misfit, np.inf), kind="stable")]

@@ -32,21 +32,10 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
 from soilbus.estimation.observation_model import FIRST_GAIN, SOIL, Latents, Linearisation, ObservationModel, Optimum
+from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
-
-MAX_ANGLE_CHANGE = 0.2
-"""Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.
-
-No evidence recorded.
-"""
-MAX_ANGLE_CHANGE_WITH_EFFECTS = 0.1
-"""The same [1] where effects have a part in the load: they may be curved where the soil alone is not."""
-SLOW_RATIO = 0.5
-"""Length of a step over that of the last, along it [1], above which steps are extrapolated.  No evidence recorded."""
-MAX_EXTRAPOLATION = 8.0
-"""Largest multiple of a full step [1] by extrapolation.  No evidence recorded."""
 
 _SOIL = len(PARAMETERS)
 
@@ -152,6 +141,11 @@ class GaussianApproximation(NamedTuple):
         return mixed @ self.step, mixed @ self.covariance @ mixed.T
 
 
+def coordinates_of(problem: ObservationModel, prior: SoilPrior) -> Coordinates:
+    """The coordinates of a window's free parameters."""
+    return Coordinates(prior, float(problem.rig.width.mean()), problem.options.search)
+
+
 class Objective:
     """-2 log posterior of a window: its residuals and those of its prior, with derivatives.
 
@@ -181,8 +175,8 @@ class Objective:
         joint_prior: Gaussian,
         as_measured: bool = False,
     ) -> None:
-        self.problem, self.joint_prior = problem, joint_prior
-        self.coordinates = Coordinates(prior, float(problem.rig.width.mean()))
+        self.problem, self.joint_prior, self.options = problem, joint_prior, problem.options.search
+        self.coordinates = coordinates_of(problem, prior)
         self.as_measured = as_measured
         is_active = np.diag(joint_prior.covariance)[_SOIL:] > 0.0
         is_active[: problem.n_sensors if as_measured else 0] = False
@@ -242,7 +236,8 @@ class Objective:
         else:
             new = self.problem.updated(at, latents, *changes)
         change = np.abs(new.entry_angle / latents.entry_angle - 1.0).max(initial=0.0)
-        if change > (MAX_ANGLE_CHANGE_WITH_EFFECTS if len(at.load_by_effects) else MAX_ANGLE_CHANGE):
+        limits = self.options
+        if change > (limits.max_angle_change_with_effects if len(at.load_by_effects) else limits.max_angle_change):
             new = self.problem.with_entry_angles(new, Soil(*soil.tolist()), gains)
         return Iterate(soil, gains, new)
 
@@ -393,47 +388,6 @@ class Termination(StrEnum):
         return self in (Termination.STEP, Termination.DECREASE)
 
 
-@dataclass(frozen=True, slots=True)
-class SolverOptions:
-    """Numbers of a descent.
-
-    Attributes
-    ----------
-    max_evaluations
-        Of the model.  Joint descents of 42 windows from random soils take 9 in the mean, 1 in 100 more than 30.
-    step_tolerance
-        Squared length of the next step in posterior sd, predicted from the ratio of the last two, from which a
-        descent has converged.  With 1e-5, 1 of 100 descents stopped in a curved valley, 0.2 of -2 log too high.
-    decrease_tolerance
-        Decrease of the objective by a step, relative to the objective and one [1], from which a descent has converged;
-        0: none.
-    damping
-        Of the first step, as a share of the diagonal [1].  With 0 steps are not damped but shortened.
-    damping_factor
-        Factor [1] on the damping after a rejected step; its inverse after an accepted one (Marquardt 1963).
-    shortening
-        Factor [1] on the fraction of the step after a rejected step, without damping; 0.3 to 0.5 do the same.
-    max_rise
-        Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Without
-        damping steps that overshoot in a curved valley return by themselves: 0.2 to 1 do the same.  It is multiplied by
-        `shortening` after each rise, so that a descent does not overshoot for ever.
-    max_rejected
-        Rejected steps in a row.
-    give_up_above
-        Value of the objective above which the fit is of no use.
-    """
-
-    max_evaluations: int = 40
-    step_tolerance: float = 1e-6
-    decrease_tolerance: float = 0.0
-    damping: float = 0.0
-    damping_factor: float = 10.0
-    shortening: float = 0.4
-    max_rise: float = 1.0
-    max_rejected: int = 6
-    give_up_above: float = math.inf
-
-
 class Solution(NamedTuple):
     """The end of a descent.
 
@@ -502,7 +456,7 @@ def minimise(
     max_rise, decrease, last_step, last_fraction = options.max_rise, math.inf, None, 1.0
     while (ended := _termination(options, here, last_decrease, decrease, evaluations, n_rejected)) is None:
         if last_step is not None and fraction == 1.0:
-            fraction = _extrapolation(here, last_step, last_fraction)
+            fraction = _extrapolation(options, here, last_step, last_fraction)
         new = objective.stepped(here.iterate, here.model, fraction * here.step)
         there = _expanded(objective, new, damping / options.damping_factor)
         evaluations += 1
@@ -533,14 +487,16 @@ def minimise(
     return Solution(end, here.iterate, here.model, here.decrease, evaluations, ended)
 
 
-def _extrapolation(here: _Expansion, last_step: Array, last_fraction: float) -> float:
+def _extrapolation(options: SolverOptions, here: _Expansion, last_step: Array, last_fraction: float) -> float:
     """Multiple of a full step to take, from the last one (F + A,) and the fraction of it that was taken.
 
     Aitken's extrapolation: above 1 where steps shrink slowly, below 1 where they turn back, else 1.
     """
     along = float(last_step @ here.model.information @ here.step) / here.model.squared_length(last_step)
     ratio = 1.0 - (1.0 - along) / last_fraction
-    return min(1.0 / max(1.0 - ratio, 1.0 / MAX_EXTRAPOLATION), MAX_EXTRAPOLATION) if abs(ratio) > SLOW_RATIO else 1.0
+    if abs(ratio) <= options.slow_ratio:
+        return 1.0
+    return min(1.0 / max(1.0 - ratio, 1.0 / options.max_extrapolation), options.max_extrapolation)
 
 
 def _expanded(objective: Objective, iterate: Iterate, damping: float) -> _Expansion | None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import Series
+from soilbus.estimation.options import EstimatorOptions
 from soilbus.terra.vehicle import Chassis, pull_required
 
 if TYPE_CHECKING:
@@ -50,16 +51,6 @@ LEAST_LEVEL = {
 }  # fmt: skip
 """Magnitudes (SI) below which relative noise shrinks no further in the outlier test: a sensor at rest still
 has its resolution and its zero error.  No evidence recorded."""
-MAX_RIM_DIFFERENCE = 1.0
-"""Relative difference of rim speeds of a turn about a centre one track from the vehicle's middle: B/R = 1.
-Steered tractors turn about centres at least 1.5 tracks away; one side that spins while the other stands is at 2."""
-MAX_AXLE_RATIO = 2.0
-"""Greatest ratio of the axles' relative differences in one turn.  The front axle's is less by the square of the
-cosine of the steering angle (1/2 at 45 degrees); the inner wheels of both axles slip about alike."""
-LEAST_SLIDING = 0.05
-"""Slip that sliding along counts at least: below it a wheel's forces are small in both directions."""
-TRACK_RANGE = (0.3, 8.0)
-"""Tracks [m] of wheeled vehicles, from small rovers to 3.2 m, the latter over 1 - slip for slips up to 0.6."""
 
 
 class SensorNoise(NamedTuple):
@@ -105,6 +96,8 @@ class Rig:
     """Of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed."""
     lengths: Array | None = None
     """(W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels."""
+    options: EstimatorOptions = field(default_factory=EstimatorOptions)
+    """Tuning values of its estimator."""
 
     @property
     def length(self) -> Array | float:
@@ -244,14 +237,15 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
 
     Where the yaw rate is known it decides: rim speeds that differ without it are wheel spin.
     With a known track the difference is B r.  Without one the rim speeds must show a turn (see
-    below) to the side of the yaw rate, by a difference that a track in `TRACK_RANGE` explains.
+    below) to the side of the yaw rate, by a difference that a possible track explains.
 
     A vehicle that steers by the speeds of its sides slides sideways in every turn; there the ratio of the lateral to
     the longitudinal sliding speed decides, too.
 
     Without a yaw rate the rim speeds decide.  In a turn the wheels of the same side are the
     faster ones on every axle, by relative differences that are equal up to the influence of
-    steering angle and tracks, and no greater than in a turn about a centre one track away.  All
+    steering angle (1/2 at 45 degrees) and tracks, and no greater than in a turn about a centre one track away: steered
+    tractors turn about centres at least 1.5 tracks away, and one side that spins while the other stands is at 2.  All
     other patterns are slip: of one wheel, of one on each axle crosswise (open differentials), of
     all on one side while the others stand, or of one axle on a side slope.  An axle with an
     unknown speed or without two wheels is ignored; without any axle no instant is in a turn.
@@ -260,8 +254,8 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
     size = np.abs(relative)
     smallest, largest = np.fmin.reduce(size, axis=1, initial=np.inf), np.fmax.reduce(size, axis=1, initial=0.0)
     same_sign = np.abs(np.nansum(np.sign(relative), axis=1)) == np.isfinite(relative).sum(axis=1)
-    by_rims = np.isfinite(smallest) & (smallest > max_turn) & (largest < MAX_RIM_DIFFERENCE)
-    by_rims &= (largest < MAX_AXLE_RATIO * smallest) & same_sign
+    by_rims = np.isfinite(smallest) & (smallest > max_turn) & (largest < 1.0)  # B/R = 1
+    by_rims &= (largest < 2.0 * smallest) & same_sign
     yaw = window.yaw_rate
     if rig.max_lateral is not None and rig.chassis is not None:
         by_rims |= _slides(window, rig, rig.max_lateral, difference)
@@ -272,8 +266,8 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
             by_yaw = rig.track * np.abs(yaw) > max_turn * np.abs(window.ground_speed)
         else:
             track = difference / yaw[:, None]  # of the axle, if the difference is the turn's alone
-            low, high = TRACK_RANGE
-            by_yaw = by_rims & (np.isnan(track) | ((track > low) & (track < high))).all(axis=1)
+            possible = np.isnan(track) | ((track > 0.3) & (track < 8.0))  # from a small rover to 3.2 m over 1 - slip
+            by_yaw = by_rims & possible.all(axis=1)
     if rig.max_lateral is not None:
         by_yaw = by_yaw | by_rims
     return np.asarray(np.where(np.isfinite(yaw), by_yaw, by_rims))
@@ -294,7 +288,8 @@ def _slides(window: Window, rig: Rig, max_lateral: float, difference: Array) -> 
     rim = rig.radius * window.speed
     known = np.isfinite(rim)
     mean = np.where(known, rim, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    along = np.maximum(np.abs(mean - window.ground_speed), LEAST_SLIDING * np.abs(window.ground_speed))
+    # below a slip of 0.05 a wheel's forces are small in both directions
+    along = np.maximum(np.abs(mean - window.ground_speed), 0.05 * np.abs(window.ground_speed))
     with np.errstate(invalid="ignore"):
         return np.asarray(yaw * rig.chassis.wheelbase / 2.0 > max_lateral * along)
 

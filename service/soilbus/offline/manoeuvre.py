@@ -20,9 +20,9 @@ import numpy as np
 
 from soilbus.config.model import Config, Noise
 from soilbus.diagnosis.diagnose import Diagnosis
+from soilbus.diagnosis.options import DEFAULT
 from soilbus.diagnosis.records import Record, TooLittle, record_of
 from soilbus.diagnosis.separation import Truth, expected_posterior, expected_probability, separations, truths
-from soilbus.diagnosis.verdict import NAMED_PROBABILITY
 from soilbus.estimation.assembly import effects_of, model_of, prior_of, rig_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
@@ -171,7 +171,7 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
     if best is None:
         return None
     found = _separations(diagnosis, config, best[0], true)
-    enough = (times for times in range(1, MAX_REPEATS + 1) if chance(found, times) >= NAMED_PROBABILITY)
+    enough = (times for times in range(1, MAX_REPEATS + 1) if chance(found, times) >= DEFAULT.named_probability)
     separations = {
         name: {other: s for other, s in zip(names, row, strict=True) if other != name}
         for name, row in zip(names, found, strict=True)

@@ -24,7 +24,6 @@ from soilbus.can.log_lines import LogLines
 from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
-from soilbus.estimation.measurements import MAX_SLIP, MIN_SLIP
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.offline.recordings import Recordings
 from soilbus.offline.replay import LogError, log_names
@@ -204,14 +203,14 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
 def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Run:
     n = len(values["slip"])
     t = np.asarray(values.get("t", np.arange(n) * ROW_PERIOD), np.float64)
-    load, slip = values["wheel_load"], values["slip"]
+    load, slip, usable = values["wheel_load"], values["slip"], rig.options.measurements
     with np.errstate(invalid="ignore"):
         faults = {
             "no_load": ~np.isfinite(load),
             "no_slip": ~np.isfinite(slip),
             "no_time": ~np.isfinite(t),
             "load_range": load <= 0.0,
-            "slip_range": (slip >= MAX_SLIP) | (slip <= MIN_SLIP),
+            "slip_range": (slip >= usable.max_slip) | (slip <= usable.min_slip),
         }
     reasons = [next((reason for reason, at in faults.items() if at[i]), "") for i in range(n)]
     kept = np.flatnonzero([not reason for reason in reasons])

@@ -16,8 +16,9 @@ from soilbus.config.model import Config
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.options import DEFAULT
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import NAMED_PROBABILITY, Verdict, gap_limit
+from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
@@ -55,7 +56,7 @@ def headline(diagnosis: Diagnosis) -> str:
 def _named(addition: Addition) -> str:
     """The name of an effect, or of the first of a set, as in "grade, lugs or one of 2 others"."""
     names = [addition.effect.name, *addition.alternatives]
-    if addition.probability >= NAMED_PROBABILITY or len(names) == 1:
+    if addition.probability >= DEFAULT.named_probability or len(names) == 1:
         return names[0]
     if len(names) == 2:
         return " or ".join(names)

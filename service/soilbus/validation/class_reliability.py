@@ -17,7 +17,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import TYPICAL_DEPTH
+from soilbus.estimation.options import SearchOptions
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
 from soilbus.estimation.tracker import TrackerOptions
 from soilbus.sensors.bins import Bins
@@ -55,7 +55,7 @@ def drawn(classes: SoilClasses, rng: np.random.Generator) -> tuple[str, Soil | N
     i = known if rng.random() < PRIOR_UNKNOWN else int(rng.integers(known))
     log_k_c, log_p, *logs = classes.centre[i] + classes.spread[i] * rng.standard_normal(6)
     k_c, (n, phi, c, K) = math.exp(log_k_c), np.exp(logs).tolist()
-    k_phi = math.exp(log_p) / TYPICAL_DEPTH**n - k_c / classes.width
+    k_phi = math.exp(log_p) / SearchOptions().typical_depth ** n - k_c / classes.width
     soil = Soil(k_c, k_phi, n, phi, c, K)
     return classes.names[i], soil if k_phi > 0.0 and phi < 1.2 else None
 

@@ -19,7 +19,7 @@ from scipy.special import softmax
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import GRID_POINTS, Node, density, profile_over_n
+from soilbus.estimation.laplace import Node, density, profile_over_n
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import MAX_PHI, Coordinates
@@ -119,11 +119,11 @@ def _draws(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
     i = int(np.searchsorted(free, _N))
     others = np.delete(np.arange(len(free)), i)
     u = np.array([node.u for node in nodes])
-    fine = np.linspace(u[0], u[-1], GRID_POINTS)
+    fine = np.linspace(u[0], u[-1], 400)
     weight = density(u, PROPOSAL_DENSITY_POWER * np.array([node.neg2_log_density for node in nodes]), fine)
     normals = [_normal(node, coordinates, others) for node in nodes]
     centre, roots = np.array([normal[0] for normal in normals]), np.array([normal[1] for normal in normals])
-    cell = rng.choice(GRID_POINTS, count, p=weight)
+    cell = rng.choice(len(fine), count, p=weight)
     log_n = np.clip(fine[cell] + (fine[1] - fine[0]) * (rng.random(count) - 0.5), u[0], u[-1])
     below = np.clip(np.searchsorted(u, log_n) - 1, 0, len(u) - 2)
     share = (log_n - u[below]) / (u[below + 1] - u[below])

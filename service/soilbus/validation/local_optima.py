@@ -18,7 +18,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import BOUND_SD, Coordinates
+from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -140,7 +140,7 @@ def cases(field: Path | None = None) -> Iterator[Case]:
 def starts(prior: SoilPrior, width: float, count: int, seed: int) -> Iterator[Soil]:
     """Random soils of the prior, clipped to the bounds of a fit; width [m] is the mean tyre's."""
     coordinates = Coordinates(prior, width)
-    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))).clip(-BOUND_SD, BOUND_SD):
+    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))):
         yield Soil(*coordinates.within(prior.median * np.exp(prior.log_std * deviation)).tolist())
 
 

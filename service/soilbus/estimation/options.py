@@ -1,0 +1,160 @@
+"""Options of the estimator: its tuning values, each once, with unit and source or evidence.
+
+    Rig.options -> Measurements.options -> every function that has a window's problem
+
+What a change of 30 % does to each is in service/docs/sensitivity.md.  What an operator may want to change is in
+`config.model`.  Numbers that only keep arithmetic finite stand where they are used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+__all__ = ["EstimatorOptions", "MeasurementOptions", "PosteriorOptions", "SearchOptions", "SolverOptions"]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementOptions:
+    """Which instants of a window are usable, and how their forces are computed."""
+
+    max_slip: float = 0.98
+    """Slip [1] from which a wheel is unusable; no evidence recorded."""
+    min_slip: float = -1.0
+    """Slip [1] (braking) up to which a wheel is unusable; no evidence recorded."""
+    cubic_selection_sd: float = 6.0
+    """Sd of the noise by which cubics through ground speeds must differ from lines to be used; no evidence recorded."""
+    load_tolerance: float = 0.02
+    """Relative error of load [1] accepted in the first entry angles; each linearisation reduces it further."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolverOptions:
+    """Numbers of a descent."""
+
+    max_evaluations: int = 40
+    """Of the model.  Joint descents of 42 windows from random soils take 9 in the mean, 1 in 100 more than 30."""
+    step_tolerance: float = 1e-6
+    """Squared length of the next step in posterior sd, predicted from the ratio of the last two, from which a descent
+    has converged.  With 1e-5, 1 of 100 descents stopped in a curved valley, 0.2 of -2 log too high."""
+    decrease_tolerance: float = 0.0
+    """Decrease of the objective by a step, relative to the objective and one [1], from which a descent has converged;
+    0: none."""
+    damping: float = 0.0
+    """Of the first step, as a share of the diagonal [1].  With 0 steps are not damped but shortened."""
+    damping_factor: float = 10.0
+    """Factor [1] on the damping after a rejected step; its inverse after an accepted one (Marquardt 1963)."""
+    shortening: float = 0.4
+    """Factor [1] on the fraction of the step after a rejected step, without damping; 0.3 to 0.5 do the same."""
+    max_rise: float = 1.0
+    """Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Without damping
+    steps that overshoot in a curved valley return by themselves: 0.2 to 1 do the same.  It is multiplied by
+    `shortening` after each rise, so that a descent does not overshoot for ever."""
+    max_rejected: int = 6
+    """Rejected steps in a row."""
+    slow_ratio: float = 0.5
+    """Length of a step over that of the last, along it [1], above which steps are extrapolated; no evidence
+    recorded."""
+    max_extrapolation: float = 8.0
+    """Largest multiple [1] of a full step by extrapolation; no evidence recorded."""
+    give_up_above: float = math.inf
+    """Value of the objective above which the fit is of no use: set by the caller."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchOptions:
+    """Starts of a window's fit, steps of the soil, bounds, and a second mode."""
+
+    thinned: int = 24
+    """Instants of a window that the search for starts uses; no evidence recorded."""
+    start_prior_sd: float = 2.0
+    """How far a start may be from the prior's median [prior sd]; with 4, the bounds, border windows end elsewhere."""
+    same_end_ratio: float = 0.02
+    """Relative difference of two objectives [1] below which two descents have met; no evidence recorded."""
+    plausible_chi2: float = 3.0
+    """Objective per residual [1] up to which an optimum of the search may be the soil's; no evidence recorded."""
+    implausible: float = 60.0
+    """Objective per thinned instant [-2 log] above which a window cannot be of one soil.  Without this limit the
+    budget of a border's search is gone before another soil is found."""
+    max_implausible_evaluations: int = 5
+    """Evaluations from an end whose objective exceeds `implausible`; no evidence recorded."""
+    as_measured_ratio: float = 2.5
+    """The objective with latents as measured over that at the optimum [1], at most; no evidence recorded."""
+    determined_k_c_sd: float = 0.6
+    """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it; no
+    evidence recorded."""
+    other_optimum_sd: float = 10.0
+    """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum; no evidence recorded."""
+    distinct_sd: float = 2.0
+    """Mahalanobis distance [sd] of two optima from which they are two modes; no evidence recorded."""
+    min_mode_share: float = 0.05
+    """Share of the probability [1] below which a second mode does not count; no evidence recorded."""
+    typical_depth: float = 0.03
+    """Sinkage [m] at which the bearing pressure is a coordinate; no evidence recorded."""
+    max_log_step: float = 0.7
+    """Longest step of a coordinate [1, a logarithm]: a factor of two; no evidence recorded."""
+    bound_sd: float = 4.0
+    """Bound of a free parameter's logarithm about the prior median [prior sd]; no evidence recorded."""
+    max_angle_change: float = 0.2
+    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated; no
+    evidence recorded."""
+    max_angle_change_with_effects: float = 0.1
+    """The same [1] where effects have a part in the load: they may be curved where the soil alone is not."""
+    soil_alone: SolverOptions = SolverOptions(
+        10, step_tolerance=1.0, decrease_tolerance=0.02, damping=1e-3, max_rise=0.0
+    )
+    """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
+    cold: SolverOptions = SolverOptions()
+    """Joint descent of soil, gains and latents from there."""
+    warm: SolverOptions = SolverOptions(step_tolerance=2e-4)
+    """Joint descent from near the optimum: of 382 windows of the golden recordings 9 in 10 end within 0.02 posterior
+    sd of it, after 2 evaluations in the mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class PosteriorOptions:
+    """What a fit's posterior is: moments, average along n, drift, path curvature, form, soil classes."""
+
+    determined_n_sd: float = 0.05
+    """Sd of log n [1] below which a posterior with one mode counts as Gaussian; no evidence recorded."""
+    min_load_signal: float = 4.0
+    """Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1
+    all of it is noise, at 4 a quarter is."""
+    first_node_step: float = 0.1
+    """Longest first step of log n [1] from the mode; no evidence recorded."""
+    node_step_growth: float = 1.4
+    """Ratio [1] of each step of log n to the one before; no evidence recorded."""
+    negligible: float = 9.0
+    """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
+    error_power: float = 1.0
+    """Power [1] of the attainable sd of a soil by which an error counts less there.  With 2 the mean square error is
+    least in units of what is attainable on each soil, with 0 that of the logarithm."""
+    error_power_of_k_c: float = 2.0
+    """The same [1] for k_c."""
+    gaussian_shift_sd: float = 0.5
+    """How far the average along n may be from the mode's [sd] for a posterior to count as Gaussian; no evidence
+    recorded."""
+    gaussian_widening: float = 1.2
+    """How much wider [1] it may be; no evidence recorded."""
+    drift_pieces: int = 5
+    """Pieces of a window, each with its own soil; no evidence recorded."""
+    steady_drift_sd: float = 7.0
+    """Prior sd of a steady change of the soil in one window, in units of `drift` [1]; no evidence recorded."""
+    knot_spacing: float = 1.0
+    """Time [s] between two knots of the path's curvature; no evidence recorded."""
+    min_curvature_gain: float = 25.0
+    """Fall of -2 log posterior from which curvature at knots is accepted; noise alone makes about 9 in a window of
+    10 s."""
+    form_stride: int = 4
+    """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
+    mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
+    one on a curve."""
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorOptions:
+    """All of them."""
+
+    measurements: MeasurementOptions = MeasurementOptions()
+    search: SearchOptions = SearchOptions()
+    posterior: PosteriorOptions = PosteriorOptions()

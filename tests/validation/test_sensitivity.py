@@ -1,0 +1,33 @@
+"""The page on tuning values has a row for each, and each says what it is."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from soilbus.diagnosis.options import DiagnosisOptions
+from soilbus.estimation.options import EstimatorOptions
+from soilbus.validation.sensitivity import Field, fields_of, with_field
+
+PAGE = Path(__file__).resolve().parents[2] / "service" / "docs" / "sensitivity.md"
+FIELDS = [*fields_of(EstimatorOptions()), *fields_of(DiagnosisOptions())]
+
+
+def test_the_page_has_every_value_and_no_other():
+    rows = re.findall(r"^\| `(.+?)` \| (\S+) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert rows == [(".".join(field.path), f"{field.value:g}") for field in FIELDS]
+
+
+def test_one_value_alone_is_changed():
+    for field in FIELDS:
+        options = EstimatorOptions() if field.path[0] in ("measurements", "search", "posterior") else DiagnosisOptions()
+        changed = with_field(options, field.path, 7.0 * field.value)
+        others = {f.path: f.value for f in fields_of(options) if f.path != field.path}
+        assert {f.path: f.value for f in fields_of(changed)} == others | {field.path: 7.0 * field.value}
+
+
+@pytest.mark.parametrize(("value", "factor", "expected"), [(0.5, 0.7, 0.35), (2, 0.7, 1), (2, 1.3, 3), (24, 1.3, 31)])
+def test_a_count_changes_by_one_at_least(value, factor, expected):
+    assert Field(("x",), value, "").varied(factor) == pytest.approx(expected)
