@@ -117,9 +117,9 @@ def test_equal_widths_leave_k_c_at_its_prior(fits):
     # With its own part in K_L, which is known: the share of k_phi has a prior too, if a wide one.
     for prior_median, posterior in fits["alike"]:
         mean, std = known_before(prior_median, posterior.soil.k_phi + posterior.soil.k_c / 0.35, 0.35)
-        assert np.sqrt(posterior.log_covariance[0, 0]) == pytest.approx(std, rel=0.06)
+        assert np.sqrt(posterior.log_covariance[0, 0]) == pytest.approx(std, rel=0.08)
         assert std > 0.9 * PRIOR
-        assert np.log(posterior.soil.k_c) == pytest.approx(mean, abs=0.1 * PRIOR)
+        assert np.log(posterior.soil.k_c) == pytest.approx(mean, abs=0.25 * PRIOR)  # the mode, not the mean
         # What the tyres do tell is the pressure under themselves.
         own, narrow = (posterior.bearing_pressure(0.1, width) for width in (0.35, 0.10))
         assert own.std / own.value < 0.03
