@@ -25,7 +25,7 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -566,7 +566,9 @@ class Tracker:
             return None
         joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
         candidates = self._candidate_transitions(change, float(window.t[0]))
-        new = self._after_transition(window, candidates, self._new_soil_prior, joint_prior)
+        new = self._after_transition(
+            window, candidates, self._new_soil_prior, joint_prior, lambda fit: not self.mismatch(fit)
+        )
         if new is not None and new.transition is not None:
             separated = without_transition(window, new.transition, self.rig.front)
             whole = present._replace(window=separated, problem=self._problem(separated))
@@ -579,7 +581,12 @@ class Tracker:
         return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
 
     def _after_transition(
-        self, window: Window, transitions: Iterable[Transition], prior: SoilPrior, joint_prior: Gaussian
+        self,
+        window: Window,
+        transitions: Iterable[Transition],
+        prior: SoilPrior,
+        joint_prior: Gaussian,
+        is_one_soil: Callable[[Fit], bool],
     ) -> _Explanation | None:
         """The data after the first of some transitions, of growing length, that leaves one soil.
 
@@ -592,7 +599,7 @@ class Tracker:
             if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
                 return None  # after a mismatch both axles and the draft must agree on the new soil
             fit = self._search(problem, prior, joint_prior)
-            if fit is not None and not self.mismatch(fit):
+            if fit is not None and is_one_soil(fit):
                 return _Explanation(Objective(problem, prior, joint_prior), fit, transition.end, None, None, transition)
         return None
 
@@ -631,7 +638,7 @@ class Tracker:
         begin, last = max(one.transition.end, float(present.window.t[0])), float(present.window.t[-1])
         ends = (begin + share * (last - begin) for share in self.options.extension_shares)
         longer = (one.transition._replace(end=end) for end in ends)
-        after = self._after_transition(present.window, longer, prior, joint_prior)
+        after = self._after_transition(present.window, longer, prior, joint_prior, self._is_settled)
         if after is None or after.fit is None:
             return one
         fall = one.fit.neg2_log_posterior - after.fit.neg2_log_posterior - (one.fit.rows - after.fit.rows)
