@@ -1,7 +1,7 @@
 """From evidences to a verdict: none, named, ambiguous or unknown, with probabilities.
 
     P(name) = exp(zeta fall / 2) / (K + sum over names of exp(zeta fall / 2)),  fall = -2 log evidence before - after
-    zeta = zeta_0 alpha / (alpha + E) = 1 / T,  E = chi2 - rows of the present model;  K: effects of the catalogue
+    zeta = zeta_0 alpha / (alpha + E) = 1 / T,  E = |chi2 - rows| of the present model;  K: effects of the catalogue
 
 No effect's formula is exactly that of the field: one that is off by a share e of its effect leaves e^2 E unexplained,
 however long the recording.  So the likelihood counts to the power zeta, as if the data were to follow some model to
@@ -77,8 +77,11 @@ def gap_limit(rows: int, options: DiagnosisOptions = DEFAULT) -> float:
 
 
 def temperature(excess: float, options: DiagnosisOptions = DEFAULT) -> float:
-    """T = 1 / zeta where the present model's squared residuals exceed their number by this much."""
-    return (1.0 + min(max(excess, 0.0), options.max_excess) / options.alpha) / options.zeta_0
+    """T = 1 / zeta where the present model's squared residuals differ from their number by this much.
+
+    Fewer than expected, as behind computed loads, are as little a description of the noise as more.
+    """
+    return (1.0 + min(abs(excess), options.max_excess) / options.alpha) / options.zeta_0
 
 
 def temperature_of_all(temperatures: Sequence[float], options: DiagnosisOptions = DEFAULT) -> float:

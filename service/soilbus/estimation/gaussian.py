@@ -137,20 +137,6 @@ class Gaussian:
         change = math.expm1(log - math.log(base)) if parameter in LINEAR else log - math.log(base)
         return change - float(self.offset[parameter])
 
-    def with_linear_cohesion(self) -> Gaussian:
-        """The same where what follows c follows c itself, which is log-normal, and not its logarithm.
-
-        E[(c / c_mode - 1)^2] = exp(2 v) - 2 exp(v / 2) + 1,  v = var(log c); c's own logarithm keeps its variance.
-        """
-        v = float(self.covariance[_C, _C])
-        if v <= 0.0:
-            return self
-        square = math.exp(2.0 * v) - 2.0 * math.exp(0.5 * v) + 1.0
-        along, scale = self.covariance[:, _C] / v, np.ones(len(self.covariance))
-        scale[_C] = math.sqrt(v / square)
-        wider = self.covariance + np.outer(along, along) * (square - v)
-        return replace(self, covariance=scale[:, None] * wider * scale)
-
     def mixture(self, other: Gaussian, share: float) -> Gaussian:
         """This mean, with the second moment about it of a mixture: this with 1 - share, the other with share."""
         held = np.diag(self.covariance)[:_SOIL] == 0.0

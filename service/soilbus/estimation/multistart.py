@@ -142,11 +142,12 @@ class Fit:
 
     @property
     def reported(self) -> Gaussian:
-        """Soil and gains to be reported: `marginalised`, else the mixture of both modes, else `mode`; linear in c."""
-        found = self.mode if self.marginalised is None else self.marginalised
-        if self.marginalised is None and self.second_mode is not None:
-            found = self.mode.mixture(self.second_mode.gaussian, self.second_mode.share)
-        return found.with_linear_cohesion()
+        """Soil and gains to be reported: `marginalised`, else the mixture of both modes, else `mode`."""
+        if self.marginalised is not None:
+            return self.marginalised
+        if self.second_mode is None:
+            return self.mode
+        return self.mode.mixture(self.second_mode.gaussian, self.second_mode.share)
 
     @property
     def converged(self) -> bool:

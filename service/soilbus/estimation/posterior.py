@@ -12,6 +12,7 @@ logarithms.  `SoilPrior` and `Posterior` hold them; `Estimate` and `Derived` are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -39,6 +40,7 @@ __all__ = [
 
 PARAMETERS = Soil._fields
 """Names of the soil parameters, in the order of every vector of them."""
+_PHI, _C = PARAMETERS.index("phi"), PARAMETERS.index("c")
 NORMAL_95 = 1.959964
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
@@ -132,14 +134,27 @@ class Posterior:
         E (x / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 for log variance v.  So value +- 1.96 std contains 94
         to 97 % of the log-normal distribution at every width: it has a long upper tail.
         """
-        variance = np.diag(self.log_covariance)
+        variance = np.diag(self.log_covariance).copy()
+        variance[_PHI] += self._excess_along_cohesion(np.eye(len(PARAMETERS))[_PHI])
         relative = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))
         return {n: Estimate(v, v * r) for n, v, r in zip(PARAMETERS, self.soil, relative.tolist(), strict=True)}
 
     def propagate(self, gradient: Array) -> float:
-        """Sd of a scalar with this gradient (6,) by the parameters in SI (first order)."""
+        """Sd of a scalar with this gradient (6,) by the parameters in SI: first order, but for the spread of c."""
         g = gradient * np.asarray(self.soil)
-        return _root(float(g @ self.log_covariance @ g))
+        return _root(float(g @ self.log_covariance @ g) + self._excess_along_cohesion(g))
+
+    def _excess_along_cohesion(self, by_logs: Array) -> float:
+        """Variance of a scalar with these derivatives (6,) by the logarithms, beyond the first order.
+
+        Forces are linear in c, so what follows c follows c itself, which is log-normal, and not its logarithm:
+        E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
+        """
+        v = float(self.log_covariance[_C, _C])
+        if v <= 0.0:
+            return 0.0
+        square = math.expm1(2.0 * v) - 2.0 * math.expm1(0.5 * v)
+        return float(by_logs @ self.log_covariance[_C] / v) ** 2 * (square - v)
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> Estimate:
         """Pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
