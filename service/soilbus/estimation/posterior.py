@@ -135,26 +135,26 @@ class Posterior:
         to 97 % of the log-normal distribution at every width: it has a long upper tail.
         """
         variance = np.diag(self.log_covariance).copy()
-        variance[_PHI] += self._excess_along_cohesion(np.eye(len(PARAMETERS))[_PHI])
+        variance[_PHI] = self._covariance(np.eye(len(PARAMETERS))[_PHI][None])[0, 0]
         relative = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))
         return {n: Estimate(v, v * r) for n, v, r in zip(PARAMETERS, self.soil, relative.tolist(), strict=True)}
 
     def propagate(self, gradient: Array) -> float:
         """Sd of a scalar with this gradient (6,) by the parameters in SI: first order, but for the spread of c."""
-        g = gradient * np.asarray(self.soil)
-        return _root(float(g @ self.log_covariance @ g) + self._excess_along_cohesion(g))
+        return _root(float(self._covariance((gradient * np.asarray(self.soil))[None])[0, 0]))
 
-    def _excess_along_cohesion(self, by_logs: Array) -> float:
-        """Variance of a scalar with these derivatives (6,) by the logarithms, beyond the first order.
+    def _covariance(self, by_logs: Array) -> Array:
+        """Covariance (S, S) of scalars with these derivatives (S, 6) by the logarithms.
 
-        Forces are linear in c, so what follows c follows c itself, which is log-normal, and not its logarithm:
-        E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
+        First order, but for c: forces are linear in it, so what follows c follows c itself, which is log-normal, and
+        not its logarithm: E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
         """
-        v = float(self.log_covariance[_C, _C])
+        covariance, v = by_logs @ self.log_covariance @ by_logs.T, float(self.log_covariance[_C, _C])
         if v <= 0.0:
-            return 0.0
+            return np.asarray(covariance)
+        along = by_logs @ self.log_covariance[_C] / v
         square = math.expm1(2.0 * v) - 2.0 * math.expm1(0.5 * v)
-        return float(by_logs @ self.log_covariance[_C] / v) ** 2 * (square - v)
+        return np.asarray(covariance + np.outer(along, along) * (square - v))
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> Estimate:
         """Pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
@@ -249,7 +249,7 @@ class Posterior:
         scalars |= {f"K_L({width:g})": tyre_modulus(self.soil, width) for width in widths}
         gradients = np.array([scalar.gradient for scalar in scalars.values()]) * np.asarray(self.soil)
         values = np.array([scalar.value for scalar in scalars.values()])
-        return Derived(tuple(scalars), values, gradients @ self.log_covariance @ gradients.T)
+        return Derived(tuple(scalars), values, self._covariance(gradients))
 
     def _estimate(self, scalar: Scalar) -> Estimate:
         return Estimate(scalar.value, self.propagate(scalar.gradient))
