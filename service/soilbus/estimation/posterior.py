@@ -146,13 +146,13 @@ class Posterior:
     def _covariance(self, by_logs: Array) -> Array:
         """Covariance (S, S) of scalars with these derivatives (S, 6) by the logarithms.
 
-        First order, but for c: forces are linear in it, so what follows c follows c itself, which is log-normal, and
-        not its logarithm: E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
+        First order, but for c: strength is linear in it, so phi follows c itself, which is log-normal, and not its
+        logarithm: E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
         """
         covariance, v = by_logs @ self.log_covariance @ by_logs.T, float(self.log_covariance[_C, _C])
         if v <= 0.0:
             return np.asarray(covariance)
-        along = by_logs @ self.log_covariance[_C] / v
+        along = by_logs[:, [_PHI, _C]] @ self.log_covariance[[_PHI, _C], _C] / v
         square = math.expm1(2.0 * v) - 2.0 * math.expm1(0.5 * v)
         return np.asarray(covariance + np.outer(along, along) * (square - v))
 
