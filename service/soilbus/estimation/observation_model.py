@@ -75,90 +75,41 @@ _SOIL_NAMES = Soil._fields
 
 
 class Layout(NamedTuple):
-    """Named slices of the residuals of W wheels and n_sensors sensor gains.
+    """Named slices of the residuals of W wheels.
 
     rows of an instant (m): torques, balance, sinkages; latents (2 W + 1): loads, speeds, ground_speed.
     columns: RESIDUAL | SOIL | sensor_columns | effect_columns; within `gains` (G,): sensors (torque_gains,
     latent_gains in the order of the latents, draft_gain), then effects.
     """
 
-    n_wheels: int
-    n_sensors: int = 0
+    torques: slice
+    balance: int
+    sinkages: slice
+    n_latents: int
+    loads: slice
+    speeds: slice
+    ground_speed: int
+    sensors: slice
+    torque_gains: slice
+    latent_gains: slice
+    draft_gain: int
+    effects: slice
+    sensor_columns: slice
+    latent_gain_columns: slice
+    effect_columns: slice
 
-    @property
-    def torques(self) -> slice:
-        """Rows of the torques."""
-        return slice(self.n_wheels)
-
-    @property
-    def balance(self) -> int:
-        """Row of the draft balance."""
-        return self.n_wheels
-
-    @property
-    def sinkages(self) -> slice:
-        """Rows of the sinkages; empty without sensors of sinkage."""
-        return slice(self.n_wheels + 1, None)
-
-    @property
-    def n_latents(self) -> int:
-        """Number of latents of an instant."""
-        return 2 * self.n_wheels + 1
-
-    @property
-    def loads(self) -> slice:
-        """Latents: wheel loads."""
-        return slice(self.n_wheels)
-
-    @property
-    def speeds(self) -> slice:
-        """Latents: wheel speeds."""
-        return slice(self.n_wheels, 2 * self.n_wheels)
-
-    @property
-    def ground_speed(self) -> int:
-        """Latent: ground speed."""
-        return 2 * self.n_wheels
-
-    @property
-    def sensors(self) -> slice:
-        """Gains of the sensors."""
-        return slice(self.n_sensors)
-
-    @property
-    def torque_gains(self) -> slice:
-        """Gains of the torque sensors."""
-        return slice(self.n_wheels)
-
-    @property
-    def latent_gains(self) -> slice:
-        """Gains of the sensors of the latents."""
-        return slice(self.n_wheels, self.n_sensors - 1)
-
-    @property
-    def draft_gain(self) -> int:
-        """Gain of the draft sensor."""
-        return self.n_sensors - 1
-
-    @property
-    def effects(self) -> slice:
-        """Effect parameters among the gains."""
-        return slice(self.n_sensors, None)
-
-    @property
-    def sensor_columns(self) -> slice:
-        """Columns of the sensor gains."""
-        return slice(FIRST_GAIN, FIRST_GAIN + self.n_sensors)
-
-    @property
-    def latent_gain_columns(self) -> slice:
-        """Columns of the gains of the latents' sensors."""
-        return slice(FIRST_GAIN + self.n_wheels, FIRST_GAIN + self.n_sensors - 1)
-
-    @property
-    def effect_columns(self) -> slice:
-        """Columns of the effect parameters."""
-        return slice(FIRST_GAIN + self.n_sensors, None)
+    @classmethod
+    def of(cls, W: int, n_sensors: int) -> Layout:
+        """The slices for W wheels; without columns of the sensor gains where n_sensors is 0."""
+        wheels, column = slice(W), FIRST_GAIN + n_sensors
+        return cls(
+            torques=wheels, balance=W, sinkages=slice(W + 1, None),
+            n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
+            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, n_sensors - 1),
+            draft_gain=n_sensors - 1, effects=slice(n_sensors, None),
+            sensor_columns=slice(FIRST_GAIN, column), latent_gain_columns=slice(FIRST_GAIN + W, column - 1),
+            effect_columns=slice(column, None),
+        )  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -356,11 +307,7 @@ class ObservationModel(Measurements):
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
         self.work = Work()
-
-    @property
-    def layout(self) -> Layout:
-        """Rows, columns and latents of the residuals."""
-        return Layout(self.n_wheels, self.n_sensors)
+        self.layout = Layout.of(self.n_wheels, self.n_sensors)
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals, their derivatives and their inverse covariance at one point.
@@ -381,7 +328,7 @@ class ObservationModel(Measurements):
         Linearisation
             With the latents eliminated: a step of soil and gains moves them as `updated` says.
         """
-        layout = self.layout if by_sensors else self.layout._replace(n_sensors=0)
+        layout = self.layout if by_sensors else Layout.of(self.n_wheels, 0)
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
         self.work.instants += self.n
         at = self._response(soil, gains, latents)
@@ -395,7 +342,7 @@ class ObservationModel(Measurements):
         delay = self.delay_terms(gains, latents, at.value[1])
         draft, inertia = self.draft * of_draft, self.inertia * of_mass
 
-        rows = np.zeros((*A.shape[:2], FIRST_GAIN + layout.n_sensors + len(gains) - self.n_sensors))
+        rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
         residual[:, torques] = self.torque * of_torque - torque
         residual[:, balance] = inertia + draft + at.extra_pull - at.value[0].sum(1)

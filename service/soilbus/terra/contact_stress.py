@@ -133,7 +133,7 @@ def dot(field: Array, rows: Array) -> Array:
 
 def integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
     """What fields (F, 2, M, N), the first few of normal stress and the rest of shear, add to W, DP and T (3, F, N)."""
-    along, across = (np.einsum("fbmn,bmn->fn", fields, rows) for rows in (rim.cos, rim.sin))
+    along, across = np.einsum("fbmn,bmn->fn", fields, rim.cos), np.einsum("fbmn,bmn->fn", fields, rim.sin)
     out = np.empty((3, *along.shape))
     normal, shear = slice(n_normal), slice(n_normal, None)
     out[0, normal], out[0, shear] = along[normal], across[shear]

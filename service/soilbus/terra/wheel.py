@@ -134,7 +134,7 @@ def wheel_forces_and_derivatives(
     of force per unit of input.
     """
     n = len(INPUTS) + len(shape)
-    of_rim, of_track = (partial(f, shape=shape) for f in (_forces_and_jacobian, track_forces_and_jacobian))
+    of_rim, of_track = partial(_forces_and_jacobian, shape=shape), partial(track_forces_and_jacobian, shape=shape)
     both = in_chunks(of_rim, of_track, 3 + 3 * n, state, model)
     return both[:3], both[3:].reshape(3, n, *both.shape[1:])
 
@@ -166,11 +166,11 @@ def in_chunks(integrate: OnRim, of_track: OnTrack, n_rows: int, state: WheelStat
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
     fields = [np.asarray(a, float) for a in state]
-    rows = WheelState(*(
+    rows = WheelState(*[
         (a if a.shape == shape else np.broadcast_to(a, shape)).reshape(n_samples)
         if a.ndim or i < 2 else float(a)  # entry angle and slip always by sample
         for i, a in enumerate(fields)
-    ))  # fmt: skip
+    ])  # fmt: skip
     out = np.empty((n_rows, n_samples))
     if rows.has_tracks:
         tracked = np.broadcast_to(np.asarray(rows.length) > 0.0, n_samples)
@@ -207,7 +207,7 @@ def _runs(
 
 def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
     """Some samples of fields that are (N,) or floats."""
-    return WheelState(*(a if isinstance(a, float) else a[chosen] for a in rows))
+    return WheelState(*[a if isinstance(a, float) else a[chosen] for a in rows])
 
 
 def _load_and_slope(at: Stress, state: WheelState, model: WheelModel) -> Array:
