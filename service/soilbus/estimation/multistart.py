@@ -29,14 +29,13 @@ from soilbus.estimation.observation_model import (
     CurvedPathFit,
     DenoisedObservationModel,
     Latents,
-    Linearisation,
     ObservationModel,
     Optimum,
 )
 from soilbus.estimation.options import SearchOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
-from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, minimise
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Solution, Termination, minimise
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
@@ -261,35 +260,33 @@ def fit_from(
     return None if fit is None or fit.neg2_log_posterior > options.give_up_above else fit
 
 
-@dataclass(frozen=True, slots=True)
-class WarmStart:
-    """A window linearised at the optimum of the window before."""
+class WarmStart(NamedTuple):
+    """A window at the optimum of the window before; its quadratic model there, None where that is not finite."""
 
     objective: Objective
     iterate: Iterate
-    linearisation: Linearisation
+    model: QuadraticModel | None
 
 
 def warm_start(
     problem: ObservationModel, prior: SoilPrior, last: Fit, joint_prior: Gaussian | None = None
 ) -> WarmStart:
-    """A window at the optimum of the window before, whose linearisation is reused for the instants of both."""
+    """A window at the optimum of the window before."""
     objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior)
-    with np.errstate(all="ignore"):
-        latents, linearisation = problem.after(last.optimum)
     soil = np.where(prior.log_std > 0.0, last.optimum.soil, prior.median)
-    return WarmStart(objective, Iterate(soil, last.optimum.gains, latents), linearisation)
+    with np.errstate(all="ignore"):
+        iterate = Iterate(soil, last.optimum.gains, problem.after(last.optimum))
+        return WarmStart(objective, iterate, objective.quadratic_model(iterate))
 
 
 def fit_warm(start: WarmStart) -> Fit | None:
-    """Fit from a warm start, whose first step needs no evaluation; None where the numbers are not finite."""
-    objective, iterate = start.objective, start.iterate
+    """Fit from a warm start; None where the numbers are not finite."""
+    objective, model = start.objective, start.model
     with np.errstate(all="ignore"):
-        model = objective.with_prior(iterate, start.linearisation)
         step = None if model is None else model.step()
         if model is None or step is None:
             return None
-        near = objective.stepped(iterate, model, step)
+        near = objective.stepped(start.iterate, model, step)
         return fit_at(
             objective,
             minimise(objective, near, objective.options.warm, model.squared_length(step)),

@@ -179,28 +179,6 @@ class Linearisation:
         """Sum of squares of the whitened residuals."""
         return float(self.normal[0, 0])
 
-    def followed_by(self, shared: int, new: Linearisation) -> Linearisation:
-        """The last `shared` instants of this, followed by `new`, which is linearised at the same soil and gains."""
-        first = len(self.load_residual) - shared
-        row = first * self.by_latents.shape[1]
-        rows, weighed = (np.concatenate([a[row:], b]) for a, b in ((self.rows, new.rows), (self.weighed, new.weighed)))
-        return Linearisation(
-            rows=rows,
-            weighed=weighed,
-            normal=rows.T @ weighed,
-            by_latents=np.concatenate([self.by_latents[first:], new.by_latents]),
-            corrected=np.concatenate([self.corrected[first:], new.corrected]),
-            variance=np.concatenate([self.variance[first:], new.variance]),
-            by_gain=np.concatenate([self.by_gain[first:], new.by_gain]),
-            by_delay=np.concatenate([self.by_delay[:, first:], new.by_delay], axis=1),
-            load_residual=np.concatenate([self.load_residual[first:], new.load_residual]),
-            load_slope=np.concatenate([self.load_slope[first:], new.load_slope]),
-            load_by_slip=np.concatenate([self.load_by_slip[first:], new.load_by_slip]),
-            load_by_soil=np.concatenate([self.load_by_soil[:, first:], new.load_by_soil], axis=1),
-            load_by_effects=np.concatenate([self.load_by_effects[:, first:], new.load_by_effects], axis=1),
-            rolling_slip=np.concatenate([self.rolling_slip[first:], new.rolling_slip]),
-        )
-
 
 @dataclass(slots=True)
 class Optimum:
@@ -766,55 +744,22 @@ class ObservationModel(Measurements):
             return self
         return self.part(np.linspace(0, self.n - 1, max_instants).round().astype(int))
 
-    def after(self, previous: Optimum) -> tuple[Latents, Linearisation]:
-        """Latents and linearisation of this window at the optimum of an earlier, overlapping one.
-
-        Shared instants are copied.  The others are linearised at their measured values; their
-        entry angles follow from load and slip by a regression on the other window.
+    def after(self, previous: Optimum) -> Latents:
+        """Latents of this window at the optimum of an earlier one: of the instants of both as there, else as measured.
 
         Parameters
         ----------
         previous : Optimum
             End point of the fit of the earlier window.
-
-        Returns
-        -------
-        Latents, Linearisation
-            Of all instants of this window.
         """
         shared = self._shared(previous.t)
-        if previous.at.by_latents.shape[1] != self._n_residuals:
-            shared = 0
-        new = self.part(slice(shared, None))
-        start = new._latents_on_curve(self._angle_curve(previous.latents))
-        at = new.linearise(Soil(*previous.soil.tolist()), previous.gains, start)
-        if not shared:
-            return start, at
-        return previous.latents.followed_by(shared, start), previous.at.followed_by(shared, at)
+        new = self.part(slice(shared, None)).start(Soil(*previous.soil.tolist()), gains=previous.gains)
+        return previous.latents.followed_by(shared, new) if shared else new
 
     def _shared(self, t: Array) -> int:
         """Number of first instants that are the last ones of times t (M,) [s]."""
         n = len(t) - int(np.searchsorted(t, self.t[0] - TIME_TOLERANCE))
         return n if 0 < n < self.n and np.abs(self.t[:n] - t[-n:]).max() < TIME_TOLERANCE else 0
-
-    def _angle_curve(self, latents: Latents) -> Array:
-        """Regression of entry angle on load and slip: coefficients (W, 4).
-
-        log entry angle = a + b log load + c slip + d slip^2, fitted wheel by wheel.
-        """
-        regressors = self._curve_regressors(latents.load, latents.speed, latents.ground_speed)
-        target = np.log(latents.entry_angle).T[:, :, None]
-        gram = regressors.transpose(0, 2, 1) @ regressors + 1e-9 * np.eye(4)
-        return np.asarray(np.linalg.solve(gram, regressors.transpose(0, 2, 1) @ target)[:, :, 0])
-
-    def _latents_on_curve(self, curve: Array) -> Latents:
-        log_angle = self._curve_regressors(self.load, self.speed, self.ground_speed) @ curve[:, :, None]
-        angle = np.exp(np.clip(log_angle[:, :, 0].T, np.log(MIN_ENTRY_ANGLE), np.log(MAX_ENTRY_ANGLE)))
-        return Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
-
-    def _curve_regressors(self, load: Array, speed: Array, ground_speed: Array) -> Array:
-        slip = 1.0 - ground_speed[:, None] / (self.rig.radius * speed)
-        return np.stack([np.ones_like(load), np.log(load), slip, slip**2], axis=-1).transpose(1, 0, 2)
 
 
 class ObservationModelWithEffects(ObservationModel):
