@@ -148,8 +148,9 @@ def test_covariance_of_residuals_equals_monte_carlo(simulated):
         noisy[name] = value + sd * rng.standard_normal(n)
     problem = ObservationModel(window_of_samples(rig, np.arange(n, dtype=float), noisy), rig, MODEL, 0.2)
     none = np.zeros(len(problem.gain_std))
-    latents = Latents(*(np.broadcast_to(a, (n, *np.shape(a))).copy() for a in (load, speed)), np.full(n, 1.5), None)
-    latents.entry_angle = np.full((n, 4), np.nan)
+    latents = Latents(
+        *(np.broadcast_to(a, (n, *np.shape(a))).copy() for a in (load, speed)), np.full(n, 1.5), np.full((n, 4), np.nan)
+    )
     at = problem.linearise(soil, none, problem.with_entry_angles(latents, soil))
     rows, weighed = (a.reshape(n, 9, -1) for a in (at.rows, at.weighed))
     # Residuals by hand, with the measured loads and speeds, not linearised at all.

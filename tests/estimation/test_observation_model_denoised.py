@@ -8,7 +8,7 @@ import pytest
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window, refine
-from soilbus.estimation.observation_model import DenoisedObservationModel, shrunk_latents
+from soilbus.estimation.observation_model import shrunk_latents
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
@@ -42,9 +42,9 @@ def test_a_window_without_variation_is_no_more_certain_than_the_bound():
     for seed in range(8):
         problem = local_optima.window(config, "wet_clay", 10.0, local_optima.constant(0.1), False, 40 + seed, still)
         fit = fit_window(problem, prior)
-        calm = DenoisedObservationModel(problem, fit.optimum)
+        calm, latents = problem.denoised(fit.optimum)
         before = Gaussian.of(prior, problem.gain_std)
-        iterate = Iterate(fit.optimum.soil, fit.optimum.gains, calm.latents)
+        iterate = Iterate(fit.optimum.soil, fit.optimum.gains, latents)
         top = refine(Objective(calm, prior, before), iterate)
         bound = cramer_rao(calm, prior, soil).log_covariance[2, 2]
         ratio.append([one.mode.covariance[2, 2] / bound for one in (fit, top)])

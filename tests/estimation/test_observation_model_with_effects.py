@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -47,7 +45,7 @@ def at(request, problems):
     latents = problem.with_entry_angles(problem.start(SOIL), SOIL, gains)
     for _ in range(4):
         there = problem._response(SOIL, gains, latents)
-        latents = replace(latents, entry_angle=latents.entry_angle + there.load_residual / there.load_slope)
+        latents = latents._replace(entry_angle=latents.entry_angle + there.load_residual / there.load_slope)
     return problem, gains, latents
 
 
@@ -71,7 +69,7 @@ def moved(problem, gains, latents):
         value = getattr(latents, name)
         step = 1e-5 * float(value.mean())
         yield (field,), step, lambda way, n=name, v=value, d=step: (
-            SOIL, gains, replace(latents, **{n: v + way * d})
+            SOIL, gains, latents._replace(**{n: v + way * d})
         )  # fmt: skip
 
 

@@ -199,7 +199,7 @@ def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
     fit = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains), SolverOptions())
     assert fit.converged
-    low, high = problem.gain_bounds()
+    low, high = problem.gain_bounds
     assert np.all(fit.mode.gains >= low - 1e-9)
     assert np.all(fit.mode.gains <= high + 1e-9)
     assert np.isfinite(low[problem.n_sensors :]).all()
@@ -214,6 +214,6 @@ def test_solved_entry_angles_carry_the_loads_with_effects(simulated):
     gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
     objective = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
     iterate = objective.start(np.asarray(SOILS["loam"]), gains=gains)
-    iterate.latents.entry_angle *= 1.1
+    np.multiply(iterate.latents.entry_angle, 1.1, out=iterate.latents.entry_angle)
     model = objective.quadratic_model(objective.with_entry_angles(iterate))
     assert np.abs(model.linearisation.load_residual).max() < 1e-3 * problem.load.mean()

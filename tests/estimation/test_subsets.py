@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior, tyre_modulus
 from soilbus.terra.soils import SOILS
 from soilbus.validation.cramer_rao import cramer_rao
 
@@ -63,7 +63,7 @@ def test_nothing_free_is_the_prior(clay):
     posterior = fit_window(clay, prior_of(())).posterior
     assert posterior.soil == CLAY
     assert not posterior.log_covariance.any()
-    assert not posterior.derived(0.02, 0.3, [0.26]).covariance.any()
+    assert posterior.bearing_pressure(0.02, 0.3).std == posterior.tan_phi().std == 0.0
 
 
 WIDTHS = {"unlike": (0.20, 0.50), "alike": (0.35, 0.35)}
@@ -130,9 +130,9 @@ def test_moduli_of_two_tyres_give_k_c_and_k_phi_as_in_the_paper(fits):
     # Eqs. 35-39: k_c = (K_L1 - K_L2) / (1/b1 - 1/b2), k_phi = K_L1 - k_c/b1; with covariance, since both are linear.
     b1, b2 = WIDTHS["unlike"]
     for _, posterior in fits["unlike"]:
-        derived = posterior.derived(0.02, 0.3, [b1, b2])
-        pair = [derived.names.index(f"K_L({b:g})") for b in (b1, b2)]
-        moduli, covariance = derived.values[pair], derived.covariance[np.ix_(pair, pair)]
+        of_tyres = [tyre_modulus(posterior.soil, width) for width in (b1, b2)]
+        by_logs = np.array([one.gradient for one in of_tyres]) * np.asarray(posterior.soil)
+        moduli, covariance = np.array([one.value for one in of_tyres]), by_logs @ posterior.log_covariance @ by_logs.T
         of_k_c = np.array([1.0, -1.0]) / (1.0 / b1 - 1.0 / b2)
         of_k_phi = np.array([1.0, 0.0]) - of_k_c / b1
         for name, weights in (("k_c", of_k_c), ("k_phi", of_k_phi)):

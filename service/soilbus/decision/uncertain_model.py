@@ -10,7 +10,6 @@ of the soil's covariance is independent of the effects.  The model's form (its o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -143,10 +142,11 @@ def _perturbed_by_form(form: FormPosterior, at: Callable[[Array], CompletedModel
 
 def _sign_inside(free: Sequence[Free], standardised: Array, step: Array) -> float:
     """Sign (1 or -1) of a step (P,) with which the parameters exceed their ranges less; beyond they are clipped."""
+    low, high = np.array([f.bounds for f in free]).reshape(-1, 2).T
 
     def lost(sign: float) -> float:
-        there = (standardised + sign * step).tolist()
-        return math.fsum(abs(f.allowed(u) - u) for f, u in zip(free, there, strict=True))
+        there = standardised + sign * step
+        return float(np.abs(np.clip(there, low, high) - there).sum())
 
     return 1.0 if lost(1.0) <= lost(-1.0) else -1.0
 

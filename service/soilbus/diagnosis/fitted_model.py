@@ -547,7 +547,7 @@ def _held_at_edges(
 ) -> tuple[Free, ...] | None:
     """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
     gains = fits[-1].mode.gains
-    edges = at_bounds(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+    edges = at_bounds(gains, *problem.gain_bounds)[problem.n_sensors :].tolist()
     leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
     if not any(leaves) or not all(fit.converged for fit in fits):
         return None

@@ -22,7 +22,6 @@ where they cross.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -308,7 +307,7 @@ class PriorFactor:
         off[: len(self._free)] = (changes - self._offset)[self._free]
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
-    def jacobian(self, soil: Array, by_logs: Array, by_values: Mapping[int, Array] | None = None) -> Array:
+    def jacobian(self, soil: Array, by_logs: Array) -> Array:
         """Derivatives (R, M) of the residuals by M unknowns.
 
         Parameters
@@ -317,16 +316,12 @@ class PriorFactor:
             In SI.
         by_logs : (F + A, M)
             Derivatives of logarithms and gains by the unknowns.
-        by_values : {index of a parameter: (M,)}, optional
-            Those of the relative change of a LINEAR parameter, where they are not those of its logarithm.
         """
         if not self._is_likelihood_factor:
             return by_logs
-        free, changes = len(self._free), by_logs[: len(self._free)].copy()
-        for parameter, row in (by_values or {}).items():
-            changes[np.searchsorted(self._free, parameter)] = row
+        free = len(self._free)
         slopes = self._deviations(soil)[1][self._free[:, None], self._free]
-        return np.vstack([slopes @ changes, by_logs[free:], by_logs[self._place]])
+        return np.vstack([slopes @ by_logs[:free], by_logs[free:], by_logs[self._place]])
 
     def _deviations(self, soil: Array) -> tuple[Array, Array]:
         """`deviations` from the mean to a soil (6,), kept for the next call with the same one."""

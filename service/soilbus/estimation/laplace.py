@@ -35,7 +35,7 @@ import numpy as np
 from soilbus.arrays import Array, Indices
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit, fit_window, refine
-from soilbus.estimation.observation_model import DenoisedObservationModel, ObservationModel
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import PosteriorOptions
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -80,7 +80,7 @@ class ProfileOverN(NamedTuple):
         n are not all free or all tyres have one width.
     """
 
-    problem: DenoisedObservationModel
+    problem: ObservationModel
     top: Fit
     nodes: list[Node]
 
@@ -90,7 +90,7 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
 
     That is where the sd of log n (`_sd_of_n`) exceeds `determined_n_sd` or there is a second mode.  There, and where
     loads hardly vary, the noise of loads and speeds may have added false information on n or c, so the denoised window
-    is fitted (`DenoisedObservationModel`).  Where k_c, k_phi and n are free and tyres differ in width, its posterior
+    is fitted (`ObservationModel.denoised`).  Where k_c, k_phi and n are free and tyres differ in width, its posterior
     is averaged along n, unless n is determined.
 
     Parameters
@@ -171,8 +171,8 @@ def profile_over_n(
 ) -> ProfileOverN | None:
     """Fits of the denoised window through its optimum near `found`, with nodes along n; None without an optimum."""
     optimum = found.optimum
-    denoised = DenoisedObservationModel(problem, optimum)
-    start = Iterate(optimum.soil, optimum.gains, denoised.latents)
+    denoised, latents = problem.denoised(optimum)
+    start = Iterate(optimum.soil, optimum.gains, latents)
     top = refine(Objective(denoised, prior, joint_prior), start)
     if top is None or not top.converged:
         return None

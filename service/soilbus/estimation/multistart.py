@@ -27,7 +27,6 @@ from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.model_form import FormPosterior
 from soilbus.estimation.observation_model import (
     CurvedPathFit,
-    DenoisedObservationModel,
     Latents,
     ObservationModel,
     Optimum,
@@ -304,7 +303,7 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
 
     Where loads and slips hardly vary, the fitted latents vary by noise alone.  Gauss-Newton takes that noise for
     information: the predicted steps are short, and the descent creeps along a valley without a meaningful end.
-    Without the noise (`DenoisedObservationModel`) the window is a regression with known regressors, and prior
+    Without the noise (`ObservationModel.denoised`) the window is a regression with known regressors, and prior
     and data make it convex.
 
     Returns
@@ -316,9 +315,9 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
         return fit
     optimum = fit.optimum
     with np.errstate(all="ignore"):
-        denoised = DenoisedObservationModel(objective.problem, optimum)
+        denoised, latents = objective.problem.denoised(optimum)
         again = Objective(denoised, objective.coordinates.prior, objective.joint_prior)
-        found = refine(again, Iterate(optimum.soil, optimum.gains, denoised.latents))
+        found = refine(again, Iterate(optimum.soil, optimum.gains, latents))
         if found is None or not found.converged:
             return fit
         near = objective.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)

@@ -8,6 +8,7 @@ effects with values; `active_with_derivatives` does so with derivatives by each 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -34,13 +35,12 @@ class Free:
         """effect.parameter, with the wheel's number where it has one."""
         return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
 
-    def within(self, u: float) -> bool:
-        """Whether the value at a standardised u is inside the parameter's range."""
-        return self.parameter.low <= self.value + self.std * u <= self.parameter.high
-
-    def allowed(self, u: float) -> float:
-        """A standardised u clipped to the parameter's range."""
-        return u if self.within(u) or self.std == 0.0 else self.standardised(self.at(u))
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The parameter's range, standardised; infinite where the parameter is held."""
+        if self.std == 0.0:
+            return -math.inf, math.inf
+        return self.standardised(self.parameter.low), self.standardised(self.parameter.high)
 
     def standardised(self, value: float) -> float:
         """The standardised u of a value; the inverse of `at`, for a parameter with prior sd > 0."""

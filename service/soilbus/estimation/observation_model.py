@@ -22,8 +22,8 @@ pull are curved in the load, so that unequal loads held equal bias the soil.  Be
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
-may also be delays of channels.  `DenoisedObservationModel` takes the derivatives at latents of which the noise
-is shrunk; the nested Laplace approximation uses it.
+may also be delays of channels.  `denoised` takes the derivatives at latents of which the noise is shrunk; the nested
+Laplace approximation uses it.
 """
 
 from __future__ import annotations
@@ -119,8 +119,7 @@ class Work:
     instants: int = 0
 
 
-@dataclass(slots=True)
-class Latents:
+class Latents(NamedTuple):
     """Latent unknowns of each instant: load [N], speed [rad/s], entry_angle [rad] (N, W); ground_speed [m/s] (N,)."""
 
     load: Array
@@ -130,12 +129,7 @@ class Latents:
 
     def followed_by(self, shared: int, new: Latents) -> Latents:
         """The last `shared` instants of these, followed by `new`."""
-        return Latents(
-            np.concatenate([self.load[-shared:], new.load]),
-            np.concatenate([self.speed[-shared:], new.speed]),
-            np.concatenate([self.ground_speed[-shared:], new.ground_speed]),
-            np.concatenate([self.entry_angle[-shared:], new.entry_angle]),
-        )
+        return Latents(*[np.concatenate([own[-shared:], other]) for own, other in zip(self, new, strict=True)])
 
     def joined(self) -> Array:
         """Loads, speeds and ground speed (N, 2 W + 1)."""
@@ -143,9 +137,7 @@ class Latents:
 
     def part(self, instants: NDArray[np.intp] | NDArray[np.bool_]) -> Latents:
         """The latents of the given instants, in that order."""
-        return Latents(
-            self.load[instants], self.speed[instants], self.ground_speed[instants], self.entry_angle[instants]
-        )
+        return Latents(*[own[instants] for own in self])
 
 
 @dataclass(slots=True)
@@ -259,6 +251,18 @@ class DelayTerms(NamedTuple):
     by_predicted: Array
 
 
+class HeldLatents(NamedTuple):
+    """What a denoised observation model holds (`ObservationModel.denoised`).
+
+    observed (N, 2 W + 1): what would be measured of the shrunk latents.  by_latents (N, m, 2 W + 1),
+    inverse (N, m, m): derivatives of the residuals by the latents, and inverse covariance.
+    """
+
+    observed: Array
+    by_latents: Array
+    inverse: Array
+
+
 class ObservationModel(Measurements):
     """One window's measurements and the wheel-soil model; `linearise` gives residuals and derivatives at any soil.
 
@@ -278,7 +282,8 @@ class ObservationModel(Measurements):
     Notes
     -----
     The nuisance parameters, `gains` (G,) throughout, are the sensors' relative gain errors
-    in the order of `gain_names`, then the effect parameters.  `work` counts evaluations.
+    in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) are the lowest and the highest
+    values, infinite where there is none.  `work` counts evaluations.
     """
 
     def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = 0.15) -> None:
@@ -286,6 +291,8 @@ class ObservationModel(Measurements):
         self.model = model
         self.work = Work()
         self.layout = Layout.of(self.n_wheels, self.n_sensors)
+        self.gain_bounds = np.full((2, len(self.gain_std)), [[-np.inf], [np.inf]])
+        self.held: HeldLatents | None = None
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals, their derivatives and their inverse covariance at one point.
@@ -304,8 +311,13 @@ class ObservationModel(Measurements):
         Returns
         -------
         Linearisation
-            With the latents eliminated: a step of soil and gains moves them as `updated` says.
+            With the latents eliminated: a step of soil and gains moves them as `updated` says.  Where latents are
+            held, derivatives are taken there with the weights of the optimum, and they stay.
         """
+        at = self._linearised(soil, gains, latents, by_sensors)
+        return at if self.held is None else self._holding(at, self.held, by_sensors)
+
+    def _linearised(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool) -> Linearisation:
         layout = self.layout if by_sensors else Layout.of(self.n_wheels, 0)
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
         self.work.instants += self.n
@@ -377,6 +389,47 @@ class ObservationModel(Measurements):
             load_by_soil=at.load_by_soil,
             load_by_effects=at.load_by_effects,
             rolling_slip=rolling_slip,
+        )
+
+    def denoised(self, optimum: Optimum) -> tuple[Self, Latents]:
+        """The model near one of its optima with loads and speeds held at shrunk values, and these.
+
+        Loads and speeds fitted instant by instant keep part of their noise.  Derivatives taken
+        there see variation that is not in the data: n is separated from k_phi by loads that
+        differ, and noisy loads differ.  This false information grows with the number of
+        instants (Neyman & Scott 1948, Econometrica 16:1).  Derivatives are therefore taken at
+        `shrunk_latents`, which leaves the score unbiased and makes the information its
+        variance (conditional score: Stefanski & Carroll 1987, Biometrika 74:703).  Weights and
+        derivatives by the latents are those of the optimum; only the entry angles are solved again.
+        """
+        soil, gains, fitted = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents
+        observed = shrunk_latents(self.observed(fitted.joined()), self.noise_of_fitted(optimum))
+        latents = self.with_entry_angles(self._latents(self.from_observed(observed), fitted.entry_angle), soil, gains)
+        by_latents = self.linearise(soil, gains, latents).by_latents
+        inverse = self.inverse_covariance(by_latents, *self.variances(gains))
+        calm = copy(self)
+        calm.held = HeldLatents(observed, by_latents, inverse)
+        return calm, latents
+
+    def _holding(self, at: Linearisation, held: HeldLatents, by_sensors: bool) -> Linearisation:
+        """A linearisation with the derivatives by the latents and the weights of the optimum."""
+        change = held.by_latents - at.by_latents
+        rows = at.rows.reshape(*change.shape[:2], -1)
+        rows[:, :, RESIDUAL] += (change @ (at.corrected - held.observed)[:, :, None])[:, :, 0]
+        if by_sensors:
+            rows[:, :, self.layout.latent_gain_columns] -= change * at.by_gain[:, None, :]
+        if len(at.by_delay):
+            rows[:, :, -len(at.by_delay) :] += np.einsum("nml,pnl->nmp", change, at.by_delay)
+        weighed, zero = (held.inverse @ rows).reshape(at.rows.shape), np.zeros_like(at.variance)
+        return replace(
+            at,
+            weighed=weighed,
+            normal=at.rows.T @ weighed,
+            by_latents=held.by_latents,
+            corrected=held.observed,
+            variance=zero,
+            by_gain=zero,
+            by_delay=at.by_delay[:0],
         )
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
@@ -584,8 +637,7 @@ class ObservationModel(Measurements):
         new = at.corrected - own_noise * (weighed @ at.by_latents)[:, 0] - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
-        new = self.from_observed(new)
-        load, speed, ground = new[:, layout.loads], new[:, layout.speeds], new[:, layout.ground_speed]
+        load, speed, ground, _ = self._latents(self.from_observed(new), latents.entry_angle)
         if self.rolls.any():
             speed = speed.copy()
             speed[:, self.rolls] = ground[:, None] / (self.rig.radius[self.rolls] * (1.0 - at.rolling_slip))
@@ -594,6 +646,13 @@ class ObservationModel(Measurements):
         return Latents(
             load, speed, ground, self.stepped_entry_angle(at, latents.entry_angle, soil_step, gain_step, more)
         )
+
+    def _latents(self, joined: Array, entry_angle: Array) -> Latents:
+        """Latents from loads, speeds and ground speed (N, 2 W + 1) and entry angles (N, W)."""
+        layout = self.layout
+        return Latents(
+            joined[:, layout.loads], joined[:, layout.speeds], joined[:, layout.ground_speed], entry_angle
+        )  # fmt: skip
 
     def stepped_entry_angle(
         self, at: Linearisation, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0
@@ -612,11 +671,7 @@ class ObservationModel(Measurements):
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) clipped to their ranges."""
-        return gains
-
-    def gain_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds (G,) of the gains; infinite where there is none."""
-        return np.full(len(self.gain_std), -np.inf), np.full(len(self.gain_std), np.inf)
+        return np.asarray(np.clip(gains, *self.gain_bounds))
 
     def variances(self, gains: Array) -> tuple[Array, Array]:
         """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
@@ -795,23 +850,12 @@ class ObservationModelWithEffects(ObservationModel):
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
+        bounds = np.array([f.bounds for f in self.free]).reshape(-1, 2)
+        self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
 
     def active(self, standardised: Array) -> list[Active]:
         """The effects with their values at standardised parameters (P,)."""
         return active_at(self.effects, self.free, standardised, self.n_wheels)
-
-    def allowed(self, gains: Array) -> Array:
-        """Gains (G,) with the effect parameters clipped to their ranges."""
-        inside = [f.allowed(u) for f, u in zip(self.free, gains[self.layout.effects].tolist(), strict=True)]
-        return np.concatenate([gains[self.layout.sensors], inside])
-
-    def gain_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds (G,) of the gains: the ranges of the effect parameters, standardised."""
-        low, high = super().gain_bounds()
-        for i, f in enumerate(self.free, self.n_sensors):
-            if f.std > 0.0:
-                low[i], high[i] = (f.parameter.low - f.value) / f.std, (f.parameter.high - f.value) / f.std
-        return low, high
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
@@ -1133,73 +1177,6 @@ def _varied(soil: Soil) -> Soil:
     """The soil with derivatives by each parameter but k_c, whose derivative is that of k_phi over the width."""
     varied = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
     return soil._replace(**varied)  # type: ignore[arg-type]
-
-
-class DenoisedObservationModel(ObservationModel):
-    """An observation model near one of its optima, with loads and speeds held at shrunk values.
-
-    Loads and speeds fitted instant by instant keep part of their noise.  Derivatives taken
-    there see variation that is not in the data: n is separated from k_phi by loads that
-    differ, and noisy loads differ.  This false information grows with the number of
-    instants (Neyman & Scott 1948, Econometrica 16:1).  Derivatives are therefore taken at
-    `shrunk_latents`, which leaves the score unbiased and makes the information its
-    variance (conditional score: Stefanski & Carroll 1987, Biometrika 74:703).  Weights and
-    derivatives by the latents are those of the optimum; only the entry angles are solved again.
-    """
-
-    def __init__(self, problem: ObservationModel, optimum: Optimum) -> None:
-        self.__dict__.update(vars(problem))
-        self._base = problem
-        layout, fitted = problem.layout, optimum.latents
-        self._shrunk = shrunk_latents(problem.observed(fitted.joined()), problem.noise_of_fitted(optimum))
-        latents = problem.from_observed(self._shrunk)
-        load, speed, ground_speed = latents[:, layout.loads], latents[:, layout.speeds], latents[:, layout.ground_speed]
-        soil = Soil(*optimum.soil.tolist())
-        self.latents = self.with_entry_angles(
-            Latents(load, speed, ground_speed, fitted.entry_angle), soil, optimum.gains
-        )
-        self._by_latents_at_optimum = problem.linearise(soil, optimum.gains, self.latents).by_latents
-        *_, variance, row_var = self._corrected(optimum.gains)
-        self._inverse = self.inverse_covariance(self._by_latents_at_optimum, variance, row_var)
-
-    def allowed(self, gains: Array) -> Array:
-        """Gains (G,) clipped to their ranges."""
-        return self._base.allowed(gains)
-
-    def gain_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds (G,) of the gains."""
-        return self._base.gain_bounds()
-
-    def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
-        """The same latents with the entry angles at which this soil carries their loads."""
-        return self._base.with_entry_angles(latents, soil, gains)
-
-    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
-        """Sinkage [m] (N, W) of the model."""
-        return self._base.sinkages(soil, gains, latents)
-
-    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
-        """As `ObservationModel.linearise`, at the shrunk latents and with the weights of the optimum; latents stay."""
-        at = self._base.linearise(soil, gains, latents, by_sensors)
-        change = self._by_latents_at_optimum - at.by_latents
-        rows = at.rows.reshape(*change.shape[:2], -1)
-        rows[:, :, RESIDUAL] += (change @ (at.corrected - self._shrunk)[:, :, None])[:, :, 0]
-        if by_sensors:
-            rows[:, :, self.layout.latent_gain_columns] -= change * at.by_gain[:, None, :]
-        if len(at.by_delay):
-            rows[:, :, -len(at.by_delay) :] += np.einsum("nml,pnl->nmp", change, at.by_delay)
-        weighed = (self._inverse @ rows).reshape(at.rows.shape)
-        zero = np.zeros_like(at.variance)
-        return replace(
-            at,
-            weighed=weighed,
-            normal=at.rows.T @ weighed,
-            by_latents=self._by_latents_at_optimum,
-            corrected=self._shrunk,
-            variance=zero,
-            by_gain=zero,
-            by_delay=at.by_delay[:0],
-        )
 
 
 def shrunk_latents(fitted: Array, variance: Array) -> Array:

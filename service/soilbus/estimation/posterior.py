@@ -7,13 +7,13 @@ Equations.
     e.g.                bearing pressure = (k_c / b_ref + k_phi) z_ref^n
 
 Free parameters are positive and spread over decades, so both distributions are Gaussian in the parameters'
-logarithms.  `SoilPrior` and `Posterior` hold them; `Estimate` and `Derived` are what is reported.
+logarithms.  `SoilPrior` and `Posterior` hold them; an `Estimate` is what is reported.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,7 +27,6 @@ from soilbus.terra.wheel import Soil
 __all__ = [
     "NORMAL_95",
     "PARAMETERS",
-    "Derived",
     "Estimate",
     "Posterior",
     "Scalar",
@@ -93,22 +92,6 @@ class Scalar(NamedTuple):
 
     value: float
     gradient: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Derived:
-    """Quantities by name: values (Q,) and covariance (Q, Q), in SI."""
-
-    names: tuple[str, ...]
-    values: Array
-    covariance: Array
-
-    def __getitem__(self, name: str) -> Estimate:
-        """One of them alone; KeyError if it is not there."""
-        if name not in self.names:
-            raise KeyError(name)
-        i = self.names.index(name)
-        return Estimate(float(self.values[i]), _root(float(self.covariance[i, i])))
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,27 +212,6 @@ class Posterior:
         free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
         off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
         return _root(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)))
-
-    def derived(self, z_ref: float, b_ref: float, widths: Iterable[float] = ()) -> Derived:
-        """The combinations that a window determines best, jointly.
-
-        Parameters
-        ----------
-        z_ref, b_ref
-            Depth and plate width [m] of the bearing pressure.
-        widths
-            Tyre widths [m].
-
-        Returns
-        -------
-        Derived
-            bearing_pressure [Pa], tan_phi [1], and for each width b K_L(b) [N/m^(n+2)], as in K_L(0.26).
-        """
-        scalars = {"bearing_pressure": bearing_pressure(self.soil, z_ref, b_ref), "tan_phi": tan_phi(self.soil)}
-        scalars |= {f"K_L({width:g})": tyre_modulus(self.soil, width) for width in widths}
-        gradients = np.array([scalar.gradient for scalar in scalars.values()]) * np.asarray(self.soil)
-        values = np.array([scalar.value for scalar in scalars.values()])
-        return Derived(tuple(scalars), values, self._covariance(gradients))
 
     def _estimate(self, scalar: Scalar) -> Estimate:
         return Estimate(scalar.value, self.propagate(scalar.gradient))

@@ -181,7 +181,7 @@ class Objective:
         is_active = np.diag(joint_prior.covariance)[_SOIL:] > 0.0
         is_active[: problem.n_sensors if as_measured else 0] = False
         self.active = np.flatnonzero(is_active)
-        self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds())
+        self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds)
         self._has_gain_bounds = bool(np.isfinite(self._gain_bounds).any())
         self.free = self.coordinates.free
         self._identity = np.eye(len(self.free) + len(self.active))
@@ -232,7 +232,7 @@ class Objective:
         at, latents = model.linearisation, iterate.latents
         if self.as_measured:
             angle = self.problem.stepped_entry_angle(at, latents.entry_angle, *changes)
-            new = replace(latents, entry_angle=angle)
+            new = latents._replace(entry_angle=angle)
         else:
             new = self.problem.updated(at, latents, *changes)
         change = np.abs(new.entry_angle / latents.entry_angle - 1.0).max(initial=0.0)

@@ -518,9 +518,10 @@ class Tracker:
         options, length, change, last = self.options, self.settings.window, self._state.change, self._fit
         if change is not None and change.t <= present.end - options.max_unexplained * length:
             change = None  # a new soil would have been found by now
-        if one.warm is None or one.warm.model is None or last is None or (change is not None and self.mismatch(one.fit)):
-            return change if self.mismatch(one.fit) else None
         fit, warm = one.fit, one.warm
+        at = None if warm is None else warm.model
+        if warm is None or at is None or last is None or (change is not None and self.mismatch(fit)):
+            return change if self.mismatch(fit) else None
         if self._good_until <= present.end - length or present.end - present.since <= options.min_to_detect * length:
             return None
         if fit is not None and fit.curved_path and self._is_settled(fit):
@@ -531,7 +532,7 @@ class Tracker:
         half_window = 0.5  # the last estimate is of its window's middle
         predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
         false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
-        found = change_statistic(warm.objective, predicted, warm.iterate, one.warm.model.linearisation, first, false_alarms)
+        found = change_statistic(warm.objective, predicted, warm.iterate, at.linearisation, first, false_alarms)
         if not found.is_alarm and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin, window = float(t[found.instant]), present.window
