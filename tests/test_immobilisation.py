@@ -17,6 +17,7 @@ from soilbus.decision.immobilisation import (
     Demand,
     Moment,
     Watch,
+    lines,
     watched,
 )
 from soilbus.simulator.drive import drive as driven
@@ -131,7 +132,7 @@ def test_slip_that_grows_as_the_vehicle_speeds_up_does_not_creep():
     out = drive(
         lambda t: 1000.0, inertia=lambda t: 480.0 * min(max(t - 10.0, 0.0), 10.0) if t < 21.0 else 0.0, until=40.0
     )
-    ends = [(0.6 - line.value) / line.slope for _, state in out[10:] if (line := state.slip.line()).slope > 0.0]
+    ends = [(0.6 - line.value) / line.slope for _, state in out[10:] if (line := lines([state.slip])[0]).slope > 0.0]
     assert min(ends) < AHEAD
     assert first_warning(out) == math.inf
 
@@ -149,7 +150,7 @@ def test_a_rise_is_as_sure_as_the_demand_did_not_swing():
         for i, now in enumerate(past):
             earlier, earliest = (past[i - lag] if i >= lag else None for lag in (15, 30))
             demand = demand.joined(0.1, now, earlier, earliest)
-        line = demand.trend.line()
+        line = lines([demand.trend])[0]
         return line.slope, demand.slope_std(line)
 
     assert slope_and_std(lambda t: 50.0 * t) == pytest.approx((50.0, 0.0), abs=1e-5)
@@ -224,7 +225,7 @@ def test_a_new_curve_is_no_new_ground():
         t, slip = 0.1 * i, 0.1 + 0.02 * math.sin(0.05 * i)
         state = watched(state, t, [slip], pull_at(slip), (CURVE, other)[i // 10 % 2])
         assert state.warning in (Alert.UNKNOWN, Alert.NONE)
-        assert i < 30 or abs(state.capacity.long.line().slope) < 0.01 * MOST
+        assert i < 30 or abs(lines([state.capacity.long])[0].slope) < 0.01 * MOST
 
 
 def test_along_a_new_curve_the_trend_is_that_of_all_moments_along_it():
@@ -299,12 +300,12 @@ def test_ground_of_which_little_is_known_yet_does_not_surely_weaken():
     for i in range(12):  # wheels that have rolled for long pull again
         capacity = capacity.joined(0.1, 6000.0 - 100.0 * i if i > 5 else None, None)
     assert capacity.is_known
-    assert capacity.short.line().slope == pytest.approx(-1000.0)
-    assert capacity.slope_std(capacity.short.line()) == math.inf
+    assert lines([capacity.short])[0].slope == pytest.approx(-1000.0)
+    assert capacity.slope_std(lines([capacity.short])[0]) == math.inf
     few = many = capacity.joined(0.1, 5000.0, 5100.0)
     for _ in range(100):
         many = many.joined(0.1, 5000.0, 5100.0)
-    line = capacity.short.line()
+    line = lines([capacity.short])[0]
     assert few.slope_std(line) > 1.5 * many.slope_std(line)
 
 

@@ -39,6 +39,8 @@ LONG_MEMORY, SHORT_MEMORY = 2.5, 0.8
 """Time constants [s] of forgetting a capacity: of ground that softens over many metres, and of a soft patch's edge."""
 SCATTER_MEMORY = 10.0
 """Time constant [s] of forgetting how much a capacity scatters."""
+CAPACITY_MEMORIES = LONG_MEMORY, SHORT_MEMORY, LONG_MEMORY, SHORT_MEMORY, SHORT_MEMORY, SCATTER_MEMORY
+"""Time constants [s] of the trends of a `Capacity`, in their order."""
 DEMAND_MEMORY = 4.0
 """Time constant [s] of forgetting a demand, of which a line is to show a rise and not a swing."""
 SWING_MEMORY = 20.0
@@ -106,36 +108,28 @@ class Trend(NamedTuple):
     y: float = 0.0
     xy: float = 0.0
 
-    def joined(self, step: float, value: float | None, memory: float) -> Trend:
-        """The regression one step later.
 
-        Parameters
-        ----------
-        step
-            [s], since the last call.
-        value
-            The new value; None adds none.
-        memory
-            [s], time constant of forgetting.
-        """
+def later(
+    trends: Iterable[Trend], step: float, values: Iterable[float | None], memories: Iterable[float]
+) -> list[Trend]:
+    """Regressions a step [s] later, each with one more value or None, and its time constant of forgetting [s]."""
+    found = []
+    for (n, x, xx, y, xy), value, memory in zip(trends, values, memories, strict=True):
         kept = math.exp(-step / memory)
-        n, x, xx, y, xy = self
         n, x, xx, y, xy = kept * n, kept * x, kept * xx, kept * y, kept * xy
-        later_x, later_xx, later_xy = x - step * n, xx - 2.0 * step * x + step**2 * n, xy - step * y
-        if value is None:
-            return Trend(n, later_x, later_xx, y, later_xy)
-        return Trend(n + 1.0, later_x, later_xx, y + value, later_xy)
+        x, xx, xy = x - step * n, xx - 2.0 * step * x + step**2 * n, xy - step * y
+        found.append(Trend(n, x, xx, y, xy) if value is None else Trend(n + 1.0, x, xx, y + value, xy))
+    return found
 
-    def line(self) -> Line:
-        """The line through the values; slope 0 where all values are of one time."""
-        spread = self.n * self.xx - self.x**2
-        slope = (self.n * self.xy - self.x * self.y) / spread if spread > 1e-9 * self.n**2 else 0.0
-        return Line((self.y - slope * self.x) / self.n, slope, spread / self.n)
 
-    @property
-    def mean(self) -> float:
-        """Of the values, the last ones counting most; 0 where there are none."""
-        return self.y / self.n if self.n > 0.0 else 0.0
+def lines(trends: Iterable[Trend]) -> list[Line]:
+    """The lines through the values; slope 0 where all values are of one time, value nan where there are none."""
+    found = []
+    for n, x, xx, y, xy in trends:
+        spread = n * xx - x**2
+        slope = (n * xy - x * y) / spread if spread > 1e-9 * n**2 else 0.0
+        found.append(Line((y - slope * x) / n, slope, spread / n) if n > 0.0 else Line(math.nan, 0.0, 0.0))
+    return found
 
 
 class Capacity(NamedTuple):
@@ -161,26 +155,15 @@ class Capacity(NamedTuple):
         x = t - t[-1]
         change = (values - values[np.searchsorted(t, t - SCATTER_LAG)]) ** 2
         change[0] = np.nan
-        return cls(
-            *_trends(
-                x,
-                [values, values, reserves, reserves, np.isfinite(values), change],
-                [LONG_MEMORY, SHORT_MEMORY, LONG_MEMORY, SHORT_MEMORY, SHORT_MEMORY, SCATTER_MEMORY],
-            )
-        )
+        series = [values, values, reserves, reserves, np.isfinite(values), change]
+        return cls(*_trends(x, series, CAPACITY_MEMORIES))
 
     def joined(self, step: float, value: float | None, earlier: float | None, reserve: float = 0.0) -> Capacity:
         """A step [s] later, with one more value [N] or None, the value SCATTER_LAG before, and its reserve [N]."""
         change = None if value is None or earlier is None else (value - earlier) ** 2
         part = None if value is None else reserve
-        return Capacity(
-            self.long.joined(step, value, LONG_MEMORY),
-            self.short.joined(step, value, SHORT_MEMORY),
-            self.reserve.joined(step, part, LONG_MEMORY),
-            self.short_reserve.joined(step, part, SHORT_MEMORY),
-            self.known.joined(step, float(value is not None), SHORT_MEMORY),
-            self.scatter.joined(step, change, SCATTER_MEMORY),
-        )
+        values = value, value, part, part, float(value is not None), change
+        return Capacity(*later(self, step, values, CAPACITY_MEMORIES))
 
     @property
     def is_known(self) -> bool:
@@ -212,7 +195,7 @@ class Demand(NamedTuple):
     def joined(self, step: float, value: float, earlier: float | None, earliest: float | None) -> Demand:
         """A step [s] later, with one more value [N]; earlier, earliest: the values SWING_TIME and twice that before."""
         change = None if earlier is None or earliest is None else (value - 2.0 * earlier + earliest) ** 2
-        return Demand(self.trend.joined(step, value, DEMAND_MEMORY), self.swing.joined(step, change, SWING_MEMORY))
+        return Demand(*later(self, step, (value, change), (DEMAND_MEMORY, SWING_MEMORY)))
 
     @property
     def swing_std(self) -> float:
@@ -347,22 +330,25 @@ def watched(
     reserve = _reserve(curve, look.slip)
     kept = before.recent[bool(before.recent and t - before.recent[0].t > LOOKS_KEPT) :]
     trend = before.capacity if curve is before.curve else _capacity_along(curve, kept)
-    earlier, once, twice = (_look_from(kept, t - lag) for lag in (SCATTER_LAG, SWING_TIME, 2.0 * SWING_TIME))
+    earlier, once, twice = _looks_from(kept, (t - SCATTER_LAG, t - SWING_TIME, t - 2.0 * SWING_TIME))
     capacity = trend.joined(
         step, _capacity_at(curve, look, reserve), None if earlier is None else _capacity_at(curve, earlier), reserve
     )
-    demand = before.demand.joined(step, look.asked, *(None if a is None else a.asked for a in (once, twice)))
+    demand = before.demand.joined(step, look.asked, once and once.asked, twice and twice.asked)
     peaks, asked = before.peaks.joined(t, pull, PEAK_MEMORY), before.asked.joined(t, look.asked, PEAK_MEMORY)
-    creep, given = before.slip.joined(step, look.slip, CREEP_MEMORY), before.given.joined(step, pull, CREEP_MEMORY)
+    creep, given = later((before.slip, before.given), step, (look.slip, pull), (CREEP_MEMORY, CREEP_MEMORY))
+    *of_capacity, rising, creeping, giving = lines((*capacity[:4], demand.trend, creep, given))
     total = pull + reserve
-    share, rise = (min(look.asked, pull) / total, demand.trend.line().slope / total) if total > 0.0 else (0.0, 0.0)
+    share, rise = (min(look.asked, pull) / total, rising.slope / total) if total > 0.0 else (0.0, 0.0)
     time_left = None
     if t - before.since >= SETTLING_TIME:
         time_left = 0.0
         if reserve > 0.0:
-            to_limit = _time_of_creep(creep, float(curve.slip[-1]), given.line().slope / total)
-            outgrown = _time_to_outgrow(capacity, look.asked, demand, asked.greatest)
-            time_left = min(_time_to_weaken(capacity, peaks.greatest, _relative_std(curve)), outgrown, to_limit)
+            time_left = _time_of_creep(creeping, float(curve.slip[-1]), giving.slope / total)
+            if capacity.is_known:
+                outgrown = _time_to_outgrow(of_capacity[0], rising, look.asked, demand, asked.greatest)
+                weak = _time_to_weaken(capacity, of_capacity, peaks.greatest, _relative_std(curve))
+                time_left = min(weak, outgrown, time_left)
     warns = before.warning is Alert.IMMOBILISATION
     enough = share > STAYING_SHARE if warns else share > RISING_SHARE and rise > STEADY_RISE and time_left is not None
     caused = t if enough or (time_left is not None and time_left < WARNING_TIME) else before.caused
@@ -439,10 +425,13 @@ def _restarted(before: Watch, t: float) -> Watch:
     return Watch(peaks=before.peaks, asked=before.asked) if t >= before.peaks.since else Watch()
 
 
-def _look_from(recent: Sequence[Look], t: float) -> Look | None:
-    """The first look from the time t [s] on; None where it came SCATTER_LAG later or more."""
-    place = bisect_left(recent, (t,))  # a look begins with its time
-    return recent[place] if place < len(recent) and recent[place].t - t < SCATTER_LAG else None
+def _looks_from(recent: Sequence[Look], times: Iterable[float]) -> list[Look | None]:
+    """The first look from each time [s] on; None where it came SCATTER_LAG later or more."""
+    found: list[Look | None] = []
+    for t in times:
+        place = bisect_left(recent, (t,))  # a look begins with its time
+        found.append(recent[place] if place < len(recent) and recent[place].t - t < SCATTER_LAG else None)
+    return found
 
 
 def _capacity_at(curve: OverSlip, look: Look, reserve: float | None = None) -> float | None:
@@ -491,26 +480,23 @@ def _relative_std(curve: OverSlip) -> float:
     return float(curve.pull_std[most] / curve.pull[most]) if curve.pull[most] > 0.0 else math.inf
 
 
-def _time_to_outgrow(capacity: Capacity, asked: float, demand: Demand, peak: float) -> float:
-    """Time [s] until draft and slope reach the capacity, both extrapolated; inf without a significant rise."""
-    if not capacity.is_known or asked < peak:
+def _time_to_outgrow(limit: Line, line: Line, asked: float, demand: Demand, peak: float) -> float:
+    """Time [s] until draft and slope, with their line, reach the capacity's limit; inf without a significant rise."""
+    if asked < peak:
         return math.inf
-    limit, line = capacity.long.line(), demand.trend.line()
     rises = line.slope > SIGNIFICANT_SD * demand.slope_std(line) or asked > ANY_RISE_SHARE * limit.value
     outgrows = asked > SURE_RISE_SHARE * limit.value and line.slope > max(limit.slope, 0.0) and rises
     return max(limit.value - asked, 0.0) / (line.slope - limit.slope) if outgrows else math.inf
 
 
-def _time_to_weaken(capacity: Capacity, peak: float, relative: float) -> float:
+def _time_to_weaken(capacity: Capacity, of_capacity: Sequence[Line], peak: float, relative: float) -> float:
     """Time [s] until the capacity, extrapolated, falls to the peak of the pull [N]; relative: sd of the curve."""
-    if not capacity.is_known:
-        return math.inf
-    slow, fast = capacity.long.line(), capacity.short.line()
+    slow, fast, reserve, short_reserve = of_capacity
     long = _time_of_weakening(capacity, slow, LONG_WEAKENING, peak)
     short = _time_of_weakening(capacity, fast, SHORT_WEAKENING, peak)
-    if _due_to_the_curve(slow, capacity.reserve.line(), relative):
+    if _due_to_the_curve(slow, reserve, relative):
         long = math.inf
-    if _due_to_the_curve(fast, capacity.short_reserve.line(), relative):
+    if _due_to_the_curve(fast, short_reserve, relative):
         short = math.inf
     if fast.slope < STEEPENING * min(slow.slope, 0.0):
         short /= STEEPENING
@@ -537,9 +523,8 @@ def _due_to_the_curve(line: Line, reserve: Line, relative: float) -> bool:
     return math.log(ratio) < SIGNIFICANT_SD * relative
 
 
-def _time_of_creep(slip: Trend, limit: float, rise: float) -> float:
+def _time_of_creep(line: Line, limit: float, rise: float) -> float:
     """Time [s] until slip, growing under a pull that hardly rises (rise [1/s]), passes the limit."""
-    line = slip.line()
     return max(limit - line.value, 0.0) / line.slope if line.slope > 0.0 and abs(rise) < STEADY_RISE else math.inf
 
 
@@ -555,4 +540,4 @@ def _trends(x: Array, series: Sequence[Array], memories: Sequence[float]) -> lis
 
 def _estimated(squares: Trend, alike: float) -> float:
     """Mean of squares, `alike` of which are correlated, widened for few values (as Student's t); inf without values."""
-    return squares.mean * (1.0 + 2.0 * alike / squares.n) if squares.n > 0.0 else math.inf
+    return squares.y / squares.n * (1.0 + 2.0 * alike / squares.n) if squares.n > 0.0 else math.inf

@@ -215,8 +215,11 @@ def forecast(
     limit = -math.log(1.0 - limits.max_slip)
     runs_away = slip.probability_above(limit, settings.slip_horizon) > settings.probability
     slips = holds and slip.rate > 0.0 and slip.value > -math.log(1.0 - settings.least_slip)
-    horizons = ((speed, settings.stop_horizon), (steady, settings.steady_horizon))
-    stops = any(1.0 - trend.probability_above(0.0, horizon) > settings.probability for trend, horizon in horizons)
+    moves_on = (
+        speed.probability_above(0.0, settings.stop_horizon),
+        steady.probability_above(0.0, settings.steady_horizon),
+    )
+    stops = 1.0 - min(moves_on) > settings.probability
     stands = stops and (slips or sample.at_limit)
     stands_now = ground <= min_speed or sample.rim <= min_speed  # nor nan: what is not known stays as it was
     since = math.inf if stands_now else min(before.since, sample.t if moves else math.inf)
@@ -224,7 +227,7 @@ def forecast(
     loses_speed = speed.rate < 0.0 and math.isfinite(speed.var)
     sinks = depth.probability_above(limits.max_sinkage, settings.slip_horizon) > settings.probability
     ahead = moves and settled and pushes and loses_speed and (sinks or runs_away or stands)
-    heard, caused = (sample.t if now else last for now, last in ((moves, before.heard), (ahead, before.caused)))
+    heard, caused = sample.t if moves else before.heard, sample.t if ahead else before.caused
     stalls = sample.t - caused < settings.hold
     return StallForecast(
         sample.t,

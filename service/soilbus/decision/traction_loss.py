@@ -163,10 +163,8 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     lasting = t - spins >= settings.spin_time
     slides = t - sticks >= settings.spin_time
     kept = math.exp(-(t - before.t) / settings.spin_time) if math.isfinite(before.slip + before.pull) else 0.0
-    slip, pull = (
-        now + kept * (late - now) if kept else now
-        for now, late in ((motion.slip, before.slip), (motion.pull, before.pull))
-    )
+    slip = motion.slip + kept * (before.slip - motion.slip) if kept else motion.slip
+    pull = motion.pull + kept * (before.pull - motion.pull) if kept else motion.pull
     last = t if lasting or stuck else before.last
     return TractionLoss(t, spins, sticks, moves, lasting, slides, stuck, last, slip, pull, ahead)
 

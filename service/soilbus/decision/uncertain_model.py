@@ -171,7 +171,7 @@ class ModelOfRows:
         """Forces (3, D, ...) [N, N, N m] and their derivatives at states and loads [N] (D, ...)."""
 
         def rows(model: CompletedModel, at: _Rows) -> Array:
-            part = WheelState(*(a if isinstance(a, float) else a[at] for a in state))
+            part = WheelState(*[a if isinstance(a, float) else a[at] for a in state])
             forces, slopes = model.forces_and_slopes(part, rear, load[at])
             return np.stack([forces, *slopes])
 
