@@ -410,11 +410,8 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
     if len(wheels) < 2:
         return
     slow, fast = (by(wheels, key=lambda s: s.rate) for by in (min, max))
-    length = min(max(1.0 / fast.rate, 0.04), 0.5 / slow.rate)
-    if (
-        slow.rate * config.estimator.bin < 1.5 <= 0.5 * fast.rate * config.estimator.bin
-        and length < config.estimator.bin
-    ):
+    present, length = config.estimator.bin, min(max(1.0 / fast.rate, 0.04), 0.5 / slow.rate)
+    if slow.rate * present < 1.5 <= 0.5 * fast.rate * present and length < present:
         yield Finding(
             f"{_key(slow.channel)}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {_key(fast.channel)}: in"
             f" bins of {present:g} s a mean stands beside a value of one instant, and loads that shake bias the soil;"
