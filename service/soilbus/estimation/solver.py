@@ -227,7 +227,8 @@ class Objective:
         step = self.step_fraction(iterate, step) * step
         soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), iterate.gains.copy()
         gains[self.active] += step[free:]
-        gains = self.problem.allowed(gains)
+        if self._has_gain_bounds:
+            gains = self.problem.allowed(gains)
         changes = soil - iterate.soil, gains - iterate.gains
         at, latents = model.linearisation, iterate.latents
         if self.as_measured:
