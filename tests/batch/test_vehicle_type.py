@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -115,3 +116,7 @@ def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):
     run("out", said.append)
     assert (out / "diagnosis.json").read_bytes() == before
     assert not any("diagnosed" in line for line in said)
+    os.utime(tmp_path / "logs/T1/a.log", (0, 0))  # another file for all that is known
+    run("out", said.append)
+    assert "1 of 1 vehicles diagnosed" in said
+    assert (out / "diagnosis.json").read_bytes() == before
