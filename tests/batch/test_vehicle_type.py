@@ -80,6 +80,18 @@ def test_what_is_common_in_other_vehicles_is_more_probable():
     assert rare["lugs"] < 0.5  # of fifty vehicles none has anything
 
 
+def test_how_common_an_effect_is_agrees_with_what_the_other_vehicles_have():
+    rng = np.random.default_rng(1)
+    chances, vehicles, names = rng.uniform(0.01, 0.2, 300), 300, 20
+    found = own_probabilities([[{"lugs": p}] for p in chances], names)
+    after = np.array([place["lugs"] for (place,) in found])
+    others = after.sum() - after
+    something = (others + 1.0) / (vehicles + 1.0)  # rule of succession: of the 299 others, and one with, one without
+    share = something * (others + 1.0) / (others + names)
+    odds = chances / (1.0 - chances) * names * share / (1.0 - something)
+    assert after == pytest.approx(odds / (1.0 + odds), abs=1e-4)
+
+
 def test_a_fleet_of_the_blind_generator():
     fault, of_type = Fault("wheel_load_offset:one", 600.0), Fault("drivetrain_loss:constant", 60.0)
     hidden = fleet(5, {1: fault}, of_type, vehicles=5, logs=1, seconds=40.0)
