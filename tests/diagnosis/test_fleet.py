@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities, onsets_of
+from soilbus.diagnosis.fleet import Onset, diagnose_vehicle, named, onset_probabilities, onsets_of
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.assembly import prior_of, rig_of, with_effects
 from soilbus.offline.fleet import judged
 from soilbus.offline.manoeuvre import record_of_recording
@@ -72,6 +73,25 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
         for wheel in rig_of(CONFIG).wheels:
             estimate = sizes[f"offset_{wheel}"]
             assert abs(estimate.value - wanted) < 4.0 * estimate.std + 60.0
+
+
+def test_logs_that_contradict_the_later_ones_stay_out_whatever_explains_these(monkeypatch):
+    """All logs together are explained by a wrong effect, those from the onset on by several that begin anywhere."""
+
+    def found(records, *_):
+        names = {"bulldozing": 0.999} if len(records) == 2 else {"grade": 0.4, "draft_offset": 0.4}
+        best, *others = names
+        alternatives = {name: names[name] for name in others}
+        addition = SimpleNamespace(effect=CATALOGUE[best], probability=names[best], alternatives=alternatives)
+        return SimpleNamespace(additions=[addition], verdict=Verdict.AMBIGUOUS)
+
+    def onsets(records, prior, of):
+        name = of.additions[0].effect.name
+        return {name: Onset(1, (0.0, 1.0), 0.0, ()) if name == "bulldozing" else Onset(0, (0.6, 0.4), 0.0, ())}
+
+    for name, fake in {"diagnose": found, "onsets_of": onsets, "factors_of": lambda *_: {}}.items():
+        monkeypatch.setattr(f"soilbus.diagnosis.fleet.{name}", fake)
+    assert diagnose_vehicle(["sound", "faulty"], None, []).probabilities == {"grade": 0.4, "draft_offset": 0.4}
 
 
 def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():

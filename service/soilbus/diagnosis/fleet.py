@@ -137,7 +137,7 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
     for _ in range(MAX_ROUNDS):
         surest = max(onsets.values(), key=lambda onset: max(onset.probabilities), default=None)
         begin = first if surest is None else surest.first
-        if begin == first:
+        if begin <= first:  # the logs before contradicted those after: another effect's onset does not undo that
             break
         # one value of the effect for all logs was wrong: it belongs to those from its onset on
         first, found = begin, diagnose(records[begin:], prior, catalogue)
