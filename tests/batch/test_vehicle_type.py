@@ -22,7 +22,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.fleet import Fault, fleet, is_true, names_given
+from soilbus.validation.fleet import Fault, fleet, is_true, names_given, rivalry
 
 GAIN = CATALOGUE["draft_gain"]
 
@@ -98,6 +98,17 @@ def test_a_fleet_of_the_blind_generator():
     names = names_given(hidden)
     assert {(one.effect, one.vehicle) for one in names} == {("drivetrain_loss", None), ("wheel_load_offset", 1)}
     assert all(is_true(one, hidden) for one in names)
+
+
+def test_what_logs_can_show_of_a_fault_depends_on_its_best_rival():
+    clear = rivalry(31, 0, Fault("wheel_load_offset:one", 500.0, 1))
+    assert clear.fall > 2.0 * clear.rival_fall > 0.0
+    assert clear.probability > 0.99
+    imitated = rivalry(31, 3, Fault("draft_offset:constant", 600.0, 1))
+    assert imitated.rival == "bulldozing"
+    assert imitated.fall > 300.0  # far better than nothing
+    assert abs(imitated.fall - imitated.rival_fall) < 3.0
+    assert max(imitated.probability, imitated.untempered) < 0.6
 
 
 def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):
