@@ -24,7 +24,7 @@ from scipy.special import expit, logsumexp, softmax
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.diagnose import Diagnosis
-from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence, own_parameters
+from soilbus.diagnosis.evidence import OwnParameters, own_parameters
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.options import TYPE_DEFAULT, TypeOptions
 from soilbus.diagnosis.records import Record
@@ -206,18 +206,14 @@ class Pool(NamedTuple):
 
     def of_all(self, chosen: Sequence[int]) -> float:
         """Log evidence of one value in the chosen vehicles, relative to the effect's absence."""
-        return float(self.log_evidence[chosen].sum()) - _neg2_log_evidence(self.sum(chosen)) / 2.0
+        return float(self.log_evidence[chosen].sum()) - self.sum(chosen).neg2_log_evidence() / 2.0
 
     def of_each(self, chosen: Sequence[int]) -> Array:
         """Log evidence (of the chosen) that each adds to the others."""
         information, vector, _ = whole = self.sum(chosen)
         others = [OwnParameters(information - self.information[i], vector - self.vector[i], self.free) for i in chosen]
-        shared = np.array([_neg2_log_evidence(each) for each in others]) - _neg2_log_evidence(whole)
+        shared = np.array([each.neg2_log_evidence() for each in others]) - whole.neg2_log_evidence()
         return np.asarray(self.log_evidence[chosen] + shared / 2.0)
-
-
-def _neg2_log_evidence(own: OwnParameters) -> float:
-    return mixture_neg2_log_evidence(own.information, own.information_vector, own.free)
 
 
 def shared_effects(
@@ -332,7 +328,7 @@ def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
     free: tuple[Free, ...] = ()
     for v, factor in factors.items():
         own = _marginal(factor.own, common)
-        log_evidence[v] = (factor.falls[name] + _neg2_log_evidence(own)) / factor.divisor / 2.0
+        log_evidence[v] = (factor.falls[name] + own.neg2_log_evidence()) / factor.divisor / 2.0
         information[v], vector[v] = own.information / factor.divisor, own.information_vector / factor.divisor
         free = own.free
     return Pool(information, vector, log_evidence, free)
@@ -340,14 +336,8 @@ def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
 
 def _marginal(own: OwnParameters, names: set[str]) -> OwnParameters:
     kept = [i for i, f in enumerate(own.free) if f.name in names]
-    mean, covariance = _moments(own)
+    mean, covariance = own.moments()
     return own_parameters(mean[kept], covariance[np.ix_(kept, kept)], [own.free[i] for i in kept])
-
-
-def _moments(own: OwnParameters) -> tuple[Array, Array]:
-    """Posterior mean (P,) and covariance (P, P), in units of the prior std."""
-    covariance = np.linalg.inv(own.information + np.eye(len(own.free)))
-    return np.asarray(covariance @ own.information_vector), np.asarray(covariance, float)
 
 
 def _agreeing(pool: Pool, own: Array, shown: Sequence[int], options: TypeOptions) -> list[int] | None:
@@ -380,15 +370,23 @@ def _own_log_evidence(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Ar
     A value of its own is paid in full in each vehicle: data divided by a temperature tell it less well (see
     OwnParameters.surcharge).
     """
-    names = sorted({rival for factors in vehicles for rival in factors[name].falls})
-    log_odds = np.full((len(vehicles), len(names)), -np.inf)
-    for v, factors in enumerate(vehicles):
+    places = []
+    for factors in vehicles:
         here = factors[name]
-        for rival, fall in here.falls.items():
-            own = factors.get(rival, here).own
-            log_odds[v, names.index(rival)] = (fall / here.divisor - own.surcharge(here.divisor)) / 2.0
-    shares = np.log(_shares(log_odds, np.arange(len(vehicles))))
-    return np.asarray(np.logaddexp(shares[:, 0], logsumexp(log_odds + shares[:, 1:], axis=1)))
+        own = {rival: factors.get(rival, here).own.surcharge(here.divisor) for rival in here.falls}
+        places.append({rival: (fall / here.divisor - own[rival]) / 2.0 for rival, fall in here.falls.items()})
+    log_odds, _ = _columns(places)
+    return np.asarray(logsumexp(log_odds + np.log(_shares(log_odds, np.arange(len(vehicles)))), axis=1))
+
+
+def _columns(places: Sequence[Mapping[str, float]], names: int = 0) -> tuple[Array, list[str]]:
+    """Log odds (R, 1 + K) of nothing and of each name, relative to nothing, and the names; at least so many columns."""
+    columns = sorted({name for place in places for name in place})
+    log_odds = np.full((len(places), 1 + max(names, len(columns))), -np.inf)
+    log_odds[:, 0] = 0.0
+    for row, place in zip(log_odds, places, strict=True):
+        row[[1 + columns.index(name) for name in place]] = list(place.values())
+    return log_odds, columns
 
 
 def _shares(log_odds: Array, vehicle: NDArray[np.intp]) -> Array:
@@ -396,17 +394,16 @@ def _shares(log_odds: Array, vehicle: NDArray[np.intp]) -> Array:
 
     Parameters
     ----------
-    log_odds : (R, K)
-        Log evidence of each effect relative to nothing, in each place for an effect.
+    log_odds : (R, 1 + K)
+        Log evidence of nothing and of each effect, relative to nothing, in each place for an effect.
     vehicle : (R,)
         Of each place.
     """
-    R, K = log_odds.shape
-    odds = np.column_stack([np.zeros(R), log_odds])
+    R, K = len(log_odds), log_odds.shape[1] - 1
     shares, before = np.full((R, 1 + K), 0.5 / K), np.zeros((R, 1 + K))
     shares[:, 0] = 0.5
     while not np.allclose(shares, before, equal_nan=True):
-        posterior, before = softmax(odds + np.log(shares), axis=1), shares
+        posterior, before = softmax(log_odds + np.log(shares), axis=1), shares
         of_vehicle = np.zeros((R, 1 + K))  # each vehicle has a place
         np.add.at(of_vehicle, vehicle, posterior)
         others = np.maximum(of_vehicle.sum(0) - of_vehicle[vehicle], 0.0)
@@ -434,25 +431,23 @@ def own_probabilities(found: Sequence[Sequence[Mapping[str, float]]], names: int
     """
     # a vehicle that shows nothing counts as one place with nothing in it
     places = [(v, place) for v, of_vehicle in enumerate(found) for place in (of_vehicle or [{}])]
-    columns = sorted({name for _, place in places for name in place})
-    K = max(names, len(columns))
-    log_odds = np.full((len(places), K), -np.inf)
-    for r, (_, place) in enumerate(places):
+    odds = []
+    for _, place in places:
         nothing = max(1.0 - sum(place.values()), ROUNDING)
-        for name, p in place.items():
-            log_odds[r, columns.index(name)] = math.log(max(p, ROUNDING) / nothing * K)
+        odds.append({name: math.log(max(p, ROUNDING) / nothing * names) for name, p in place.items()})
+    log_odds, columns = _columns(odds, names)
     shares = _shares(log_odds, np.array([v for v, _ in places], int))
-    posterior = softmax(np.column_stack([np.zeros(len(places)), log_odds]) + np.log(shares), axis=1)[:, 1:]
+    posterior = softmax(log_odds + np.log(shares), axis=1)[:, 1:]
     out: list[list[dict[str, float]]] = [[] for _ in found]
-    for r, (v, place) in enumerate(places):
+    for (v, place), of_place in zip(places, posterior, strict=True):
         if place:
-            out[v].append({name: float(posterior[r, columns.index(name)]) for name in place})
+            out[v].append({name: float(of_place[columns.index(name)]) for name in place})
     return out
 
 
 def _given(parameters: Sequence[Free], likelihood: OwnParameters) -> tuple[Free, ...]:
     """An effect's parameters with the posterior by a likelihood as prior."""
-    mean, covariance = _moments(likelihood)
+    mean, covariance = likelihood.moments()
     sd = np.sqrt(np.diag(covariance))
     at = {f.name: i for i, f in enumerate(likelihood.free)}
     return tuple(
