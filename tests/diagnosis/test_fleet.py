@@ -75,6 +75,16 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
             assert abs(estimate.value - wanted) < 4.0 * estimate.std + 60.0
 
 
+def test_a_fault_that_begins_is_not_taken_for_what_a_log_has_for_itself():
+    """Under one gain for all logs a slope of the second one, which nothing measures, explains more."""
+    catalogue = [CATALOGUE[name] for name in ("draft_gain", "grade", "bulldozing", "rut_recovery", "stress_peak_shift")]
+    found = diagnose_vehicle(
+        [record(1, 7, "loam"), record(2, 7, "dry_sand", "draft_gain=0.12")], prior_of(CONFIG), catalogue
+    )
+    assert found.probabilities["draft_gain"] > 0.95
+    assert found.onsets["draft_gain"].first == 1
+
+
 def test_logs_that_contradict_the_later_ones_stay_out_whatever_explains_these(monkeypatch):
     """All logs together are explained by a wrong effect, those from the onset on by several that begin anywhere."""
 
@@ -89,9 +99,11 @@ def test_logs_that_contradict_the_later_ones_stay_out_whatever_explains_these(mo
         name = of.additions[0].effect.name
         return {name: Onset(1, (0.0, 1.0), 0.0, ()) if name == "bulldozing" else Onset(0, (0.6, 0.4), 0.0, ())}
 
-    for name, fake in {"diagnose": found, "onsets_of": onsets, "factors_of": lambda *_: {}}.items():
+    fakes = {"diagnose": found, "onsets_of": onsets, "factors_of": lambda *_: {}, "fit_model": lambda *_: None}
+    for name, fake in fakes.items():
         monkeypatch.setattr(f"soilbus.diagnosis.fleet.{name}", fake)
-    assert diagnose_vehicle(["sound", "faulty"], None, []).probabilities == {"grade": 0.4, "draft_offset": 0.4}
+    logs = [SimpleNamespace(training=SimpleNamespace(effects=())) for _ in range(2)]
+    assert diagnose_vehicle(logs, None, []).probabilities == {"grade": 0.4, "draft_offset": 0.4}
 
 
 def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():

@@ -94,21 +94,22 @@ def fleet(
     for v in range(vehicles):
         records = []
         for log in range(logs):
-            hidden = [shared] if shared else []
-            if v in faults and log >= faults[v].first:
-                hidden.append(faults[v])
-            records.append(_record(seed, v, log, hidden, seconds))
+            own = faults[v] if v in faults and log >= faults[v].first else None
+            records.append(_record(seed, v, log, own, shared, seconds))
         all_records.append(tuple(records))
     return Fleet(tuple(all_records), faults, shared)
 
 
-def _record(seed: int, vehicle: int, log: int, hidden: Sequence[Fault], seconds: float) -> Record:
+def _record(
+    seed: int, vehicle: int, log: int, own: Fault | None, shared: Fault | None = None, seconds: float = SECONDS
+) -> Record:
     config, rng = reference_configuration(), np.random.default_rng([seed, vehicle, log])
     name = str(rng.choice(SOILS))
     soil, forms = soil_named(name), {form.title: form for form in FORMS}
-    # what a form draws for itself, such as a sign, is the vehicle's
-    setting = Setting(soil, plain_sinkage(soil), np.random.default_rng([seed, vehicle]))
-    how = together([forms[one.form].hide(one.size, setting) for one in hidden])
+    # what a form draws for itself, such as a sign, is the type's or the vehicle's
+    drawn = ((shared, [seed]), (own, [seed, vehicle]))
+    settings = [(one, Setting(soil, plain_sinkage(soil), np.random.default_rng(of))) for one, of in drawn if one]
+    how = together([forms[one.form].hide(one.size, setting) for one, setting in settings])
     x = np.cumsum(np.concatenate([[0.0], rng.uniform(12.0, 25.0, 20)]))
     slope = rng.uniform(-0.04, 0.04, len(x))
     drive = Scenario(
@@ -181,7 +182,7 @@ def rivalry(seed: int, vehicle: int, fault: Fault) -> Rivalry:
     """One vehicle's fault beside each effect of the catalogue in its place."""
     config = reference_configuration()
     prior = prior_of(config)
-    records = [_record(seed, vehicle, log, [fault], SECONDS) for log in range(fault.first, LOGS)]
+    records = [_record(seed, vehicle, log, fault) for log in range(fault.first, LOGS)]
     base = fit_model(records, prior, ())
     assert base is not None
     falls: dict[str, float] = {}
