@@ -120,7 +120,7 @@ def window_of(config, rig, seconds=6.0):
         elif quantity in mapped:
             mean[:, i] = truth[quantity]
     count = 5.0 * np.isfinite(mean)
-    return made_window(NoiseTable.of(rig), t, mean, count, count)
+    return made_window(NoiseTable.of(rig), t, mean, count, int(count.sum()))
 
 
 def test_each_machine_has_as_many_independent_rows_as_wheels(machine):

@@ -68,6 +68,21 @@ def rear_drive() -> list[Frame]:
     return [frame_of(message) for message in frames(recording, config)]
 
 
+def test_wheel_speeds_slower_than_torques_ask_for_shorter_bins(clay_drive):
+    """What is measured at one instant beside means over 0.1 s: the advice, and none where it is followed."""
+    config = reference_configuration()
+    identifier = load_databases(config).get_message_by_name("WheelSpeeds").frame_id
+    speeds = [frame for frame in clay_drive if frame[1] == identifier]
+    slow = set(map(id, speeds)) - set(map(id, speeds[::5]))
+    heard = [frame for frame in clay_drive if id(frame) not in slow]
+    (advice,) = (text for text in beside(config, heard).warnings if "estimator.bin" in text)
+    assert "10 values a second beside 50" in advice
+    assert advice.endswith("set estimator.bin = 0.04")
+    shorter = reference_configuration(["estimator.bin=0.04"])
+    assert not any("estimator.bin" in text for text in beside(shorter, heard).warnings)
+    assert not any("estimator.bin" in text for text in beside(config, clay_drive).warnings)
+
+
 # --- nothing where there is nothing ---
 
 

@@ -359,7 +359,7 @@ class NoiseTable(NamedTuple):
         return np.sqrt(sd, out=sd)
 
 
-def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, count: Array) -> Window:
+def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, samples: int) -> Window:
     """A window from bin means.
 
     Parameters
@@ -371,14 +371,14 @@ def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, count: A
     mean : Array
         Bin means (N, channels), in the order of `Rig.channels`.
     worth : Array
-        Effective number of independent samples in each bin (N, channels).
-    count : Array
-        Number of samples in each bin (N, channels).
+        Effective number of independent samples in each bin (N, channels); 0 where it has no value.
+    samples : int
+        Number of samples in all bins.
     """
-    variance = _variance_of_means(mean, np.where(count > 0.0, worth, 0.0), noise)
+    variance = _variance_of_means(mean, worth, noise)
     values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
     columns: dict[str, Any] = values
-    return Window(t=t, variance=variances, samples=int(count.sum()), curves={}, **columns)
+    return Window(t=t, variance=variances, samples=samples, curves={}, **columns)
 
 
 def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:
@@ -408,7 +408,7 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
         if name in samples and (not names or name in names):
             mean[:, i] = samples[name]
     one = np.isfinite(mean).astype(float)
-    return made_window(NoiseTable.of(rig), np.asarray(t, float), mean, one, one)
+    return made_window(NoiseTable.of(rig), np.asarray(t, float), mean, one, int(one.sum()))
 
 
 def zero_if_unknown(values: Array) -> Array:

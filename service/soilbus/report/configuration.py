@@ -206,7 +206,7 @@ def _expected(config: Config) -> tuple[float, float] | None:
         if quantity in ("torque", "speed", "load") or quantity in mapped:
             mean[:, i] = channel_value(rig, quantity, part, truth[quantity]) if part else truth[quantity]
     count = np.isfinite(mean) * s.bin * SAMPLES_PER_SECOND
-    window = completed(made_window(NoiseTable.of(rig), t, mean, count, count), rig)
+    window = completed(made_window(NoiseTable.of(rig), t, mean, count, int(count.sum())), rig)
     task = WindowTask(
         index=0, start=0.0, end=s.window, window=window, slip=dict.fromkeys(rig.wheels), missing=(), poor=(),
         torque_limit=np.full(len(rig.wheels), np.nan), track=PositionTrack({}), rejected={}, fresh=True,

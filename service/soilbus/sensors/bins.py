@@ -4,7 +4,7 @@
     variance = noise / (n w),  w = 1 / (1 + d^2 / 2)     n: samples, d: shift in bins, w: worth of a sample
 
 Sums and counts are kept by bin and channel.  Each sample is added once, however many windows contain it.  A bin without
-a sample is nan.
+a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins (`_bridged`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.window import NoiseTable, Rig, Window, made_window
+from soilbus.estimation.window import WHEEL_QUANTITIES, NoiseTable, Rig, Window, made_window
 from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
 
 GLIMPSE_BACK = 1.0
@@ -141,8 +141,55 @@ class Bins:
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, since = total / count, time / count
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
+        of_vehicle = slice(len(WHEEL_QUANTITIES) * self._noise.n_wheels, None)
+        samples, count = int(count.sum()), count.copy()
+        bridged = _bridged(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
+        for table, columns in zip((mean, since, count), bridged, strict=True):
+            table[:, of_vehicle] = columns
         mean, worth = _at_centres(mean, since, centre)
-        return made_window(self._noise, self.origin + centre, mean, count * worth, count)
+        return made_window(self._noise, self.origin + centre, mean, count * worth, samples)
+
+
+def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Array, Array, Array]:
+    """Bins between the samples of channels that are slower than the bins, on the line from sample to sample.
+
+    Parameters
+    ----------
+    mean, since, count
+        (N, channels), mean value, mean sample time [s] and number of samples of each bin.
+    centre
+        (N,) [s].
+
+    Returns
+    -------
+    mean, since, per_bin
+        The same, with the bins between two samples filled. The samples are shared among the bins: n samples are worth
+        no more than n.
+
+    Notes
+    -----
+    For channels of the vehicle only, whose mass lets them change slowly.  What a wheel does swings with its load at
+    1.5 to 3 Hz, so a wheel's bin holds what was measured in it or nothing.  A gap of more than one and a half times the
+    channel's usual one, where a sample is lost, stays empty.
+    """
+    filled = count > 0.0
+    n_filled = filled.sum(0)
+    slow = np.flatnonzero((n_filled < 0.75 * len(filled)) & (n_filled > 2))
+    if not len(slow):
+        return mean, since, count
+    mean, since, per_bin = mean.copy(), since.copy(), count.copy()
+    for channel in slow:
+        at = np.flatnonzero(filled[:, channel])
+        step = np.diff(at)
+        usual = np.median(step)
+        if usual < 2.0:
+            continue
+        step = np.where(step <= 1.5 * usual, step, 1)
+        between = np.concatenate([np.arange(i + 1, i + n) for i, n in zip(at, step, strict=False)])
+        mean[between, channel] = np.interp(centre[between], since[at, channel], mean[at, channel])
+        since[between, channel] = centre[between]
+        per_bin[np.concatenate([at, between]), channel] = count[:, channel].sum() / (len(at) + len(between))
+    return mean, since, per_bin
 
 
 def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:

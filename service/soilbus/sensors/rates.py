@@ -86,13 +86,14 @@ def resolved_window(store: Bins, end: float) -> Window:
         return replace(whole, curves=curves)
     n = int(np.floor(span / length + 1e-9))
     mean: Array = np.full((n, len(names)), np.nan)
-    worth, count = np.zeros(mean.shape), np.zeros(mean.shape)
+    worth, counted = np.zeros(mean.shape), 0
     centre: Array = store.origin + (np.arange(n, dtype=np.float64) + 0.5) * length
     for channel in channels:
         found = _binned(channel, length, n)
         at = found.bins, channel.column
-        mean[at], worth[at], count[at] = found.value, found.worth, found.samples
-    return replace(made_window(noise, centre, mean, worth, count), curves=curves)
+        mean[at], worth[at] = found.value, found.worth
+        counted += int(found.samples.sum())
+    return replace(made_window(noise, centre, mean, worth, counted), curves=curves)
 
 
 def _channels(samples: Samples, store: Bins, noise: NoiseTable) -> Iterator[_Channel]:

@@ -216,7 +216,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
         return Survey(seen, (Finding(text, True),), ())
     findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database, limits))]
-    findings += _stuck_and_jagged(seen, longest, config, limits)
+    findings += [*_stuck_and_jagged(seen, longest, config, limits), *_mixed_rates(seen, config)]
     facts = _facts(with_motors, mapped, longest)
     open_questions = [f"{_key(s.channel)}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
     if facts is not None:
@@ -402,6 +402,22 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limi
                 True,
                 (name,),
             )
+
+
+def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
+    """Bins that hold one sample of a wheel's channel and several of another: a mean beside a value of one instant."""
+    wheels = [s for s in seen if s.channel.quantity in ("torque", "speed", "load") and s.rate > 0.0]
+    if len(wheels) < 2:
+        return
+    slow, fast = (by(wheels, key=lambda s: s.rate) for by in (min, max))
+    present, length = config.estimator.bin, min(max(1.0 / fast.rate, 0.04), 0.5 / slow.rate)
+    if slow.rate * present < 1.5 <= 0.5 * fast.rate * present and length < present:
+        yield Finding(
+            f"{_key(slow.channel)}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {_key(fast.channel)}: in"
+            f" bins of {present:g} s a mean stands beside a value of one instant, and loads that shake bias the soil;"
+            f" set estimator.bin = {length:.2g}",
+            False,
+        )
 
 
 # --- signals compared with each other ---
