@@ -75,14 +75,26 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
             assert abs(estimate.value - wanted) < 4.0 * estimate.std + 60.0
 
 
-def test_a_fault_that_begins_is_not_taken_for_what_a_log_has_for_itself():
-    """Under one gain for all logs a slope of the second one, which nothing measures, explains more."""
-    catalogue = [CATALOGUE[name] for name in ("draft_gain", "grade", "bulldozing", "rut_recovery", "stress_peak_shift")]
-    found = diagnose_vehicle(
-        [record(1, 7, "loam"), record(2, 7, "dry_sand", "draft_gain=0.12")], prior_of(CONFIG), catalogue
-    )
-    assert found.probabilities["draft_gain"] > 0.95
-    assert found.onsets["draft_gain"].first == 1
+@pytest.mark.parametrize(("explained", "name"), [(700.0, "draft_gain"), (900.0, "grade")])
+def test_logs_that_contradict_each_other_are_diagnosed_apart_where_that_explains_more(explained, name, monkeypatch):
+    """-2 log evidence: 1000 for both logs together, 100 for each by itself; an effect that begins explains 50 more."""
+
+    def found(records, *_):
+        best, fall = ("grade", explained) if len(records) == 2 else ("draft_gain", 50.0)
+        addition = SimpleNamespace(effect=CATALOGUE[best], probability=0.9, alternatives={})
+        models = {"base": SimpleNamespace(neg2_log_evidence=fall), "completed": SimpleNamespace(neg2_log_evidence=0.0)}
+        return SimpleNamespace(additions=[addition], verdict=Verdict.NAMED, **models)
+
+    fakes = {
+        "diagnose": found,
+        "fit_model": lambda records, *_: SimpleNamespace(neg2_log_evidence=1000.0 if len(records) == 2 else 100.0),
+        "onsets_of": lambda *_: {},
+        "factors_of": lambda *_: {},
+    }
+    for function, fake in fakes.items():
+        monkeypatch.setattr(f"soilbus.diagnosis.fleet.{function}", fake)
+    logs = [SimpleNamespace(training=SimpleNamespace(effects=())) for _ in range(2)]
+    assert diagnose_vehicle(logs, None, []).probabilities == {name: 0.9}
 
 
 def test_logs_that_contradict_the_later_ones_stay_out_whatever_explains_these(monkeypatch):
