@@ -15,7 +15,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
 from soilbus.offline.batch import BatchError, jobs_of, run_batch
-from soilbus.offline.parts import Job, Outcome
+from soilbus.offline.parts import Outcome
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
 from soilbus.pipeline.pipeline import Pipeline
@@ -165,6 +165,30 @@ def test_a_log_repaired_is_read_again(client, config, logs, moved, tmp_path):
     assert run_batch(client, own, tmp_path / "out").resumed == 1
 
 
+def test_a_good_log_that_changed_is_read_again(client, config, moved, tmp_path):
+    changed, same, url = tmp_path / "red/a.log", tmp_path / "red/b.log", "memory://changed/c.log"
+    changed.parent.mkdir()
+    same.write_text(moved(20.0))
+
+    def write(text: str, longer: str) -> None:
+        changed.write_text(text)
+        with fsspec.open(url, "w") as file:
+            file.write(longer)
+
+    write(moved(0.0), moved(0.0))
+    own, out = jobs_of(config, "t", [str(changed), str(same), url], no_other), tmp_path / "out"
+    run_batch(client, own, out)
+    write(moved(400.0), moved(400.0) + "(1700000500.0) can0 7AB#0102\n")  # the file as large as before, the URL's not
+    assert run_batch(client, own, out).resumed == 1
+    run_batch(client, own, tmp_path / "new")
+    assert files(out) == files(tmp_path / "new")
+    times = pd.read_parquet(out / "windows").groupby("log").time.min()
+    assert (times[url] - times[str(same)]).total_seconds() == pytest.approx(380.0)
+    write("no log at all\n", "no log at all\n")
+    batch = run_batch(client, own, out)
+    assert (batch.resumed, batch.windows, len(batch.errors)) == (1, 5, 2)
+
+
 def test_a_fault_is_kept_until_its_file_changes_or_on_request(client, config, logs, tmp_path):
     for name in ("cut.log", "garbage.log", "other.log"):
         shutil.copy(logs / "blue" / name, tmp_path)
@@ -205,8 +229,19 @@ class KilledWorker(Exception):
     """By the name of Dask's."""
 
 
-def die(job: Job, version: str) -> Outcome:
-    raise KilledWorker(job.log)
+def die(job: object, *_: object) -> Outcome:
+    raise KilledWorker(job)
+
+
+def test_a_vehicle_whose_diagnosis_failed_is_diagnosed_again_on_request(client, config, logs, tmp_path, monkeypatch):
+    own = jobs_of(config, "t", [str(logs / "red")], no_other)
+    with monkeypatch.context() as patch:
+        patch.setattr("soilbus.offline.batch.findings_of", die)
+        run_batch(client, own, tmp_path, diagnose=True)
+    said: dict[bool, list[str]] = {False: [], True: []}
+    for retry, lines in said.items():
+        run_batch(client, own, tmp_path, lines.append, diagnose=True, retry=retry)
+    assert ["1 of 1 vehicles diagnosed" in lines for lines in said.values()] == [False, True]
 
 
 def test_a_manifest_names_vehicle_start_and_configuration(client, config, logs, drive, tmp_path):

@@ -98,6 +98,19 @@ def test_logs_sent_along_and_by_url_give_what_a_worker_here_finds(
     assert list(pd.read_parquet(tmp_path / "there/errors.parquet").fault) == [f"{url}/red/none.log: no such file"]
 
 
+def test_a_log_that_is_too_large_to_be_sent_along_is_one_line(address, here, tractor, tmp_path):
+    large = here / "red/large.log"
+    large.touch()
+    os.truncate(large, 257 * 2**20)  # sparse
+    try:
+        assert main(["batch", "--config", tractor, str(large), "--out", str(tmp_path), "--scheduler", address]) == 1
+    finally:
+        large.unlink()
+    (fault,) = pd.read_parquet(tmp_path / "errors.parquet").fault
+    assert fault.startswith(f"{large}: workers do not see this path, and with 257 MiB it is too large")
+    assert "(at most 256 MiB): put it where they see the same path, or name it by a URL" in fault
+
+
 def test_a_dbc_that_no_server_has_is_one_line(address, url, tractor, tmp_path, capsys):
     command = ["--set", f'dbc.input=["{url}/none.dbc"]', f"{url}/red/one.log", "--out", str(tmp_path / "out")]
     assert main(["batch", "--config", tractor, *command, "--scheduler", address]) == 2

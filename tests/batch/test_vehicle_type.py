@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.fleet import Fault, fleet, is_true, names_given
+from soilbus.validation.fleet import Fault, fleet, is_true, names_given, rivalry
 
 GAIN = CATALOGUE["draft_gain"]
 
@@ -79,12 +80,35 @@ def test_what_is_common_in_other_vehicles_is_more_probable():
     assert rare["lugs"] < 0.5  # of fifty vehicles none has anything
 
 
+def test_how_common_an_effect_is_agrees_with_what_the_other_vehicles_have():
+    rng = np.random.default_rng(1)
+    chances, vehicles, names = rng.uniform(0.01, 0.2, 300), 300, 20
+    found = own_probabilities([[{"lugs": p}] for p in chances], names)
+    after = np.array([place["lugs"] for (place,) in found])
+    others = after.sum() - after
+    something = (others + 1.0) / (vehicles + 1.0)  # rule of succession: of the 299 others, and one with, one without
+    share = something * (others + 1.0) / (others + names)
+    odds = chances / (1.0 - chances) * names * share / (1.0 - something)
+    assert after == pytest.approx(odds / (1.0 + odds), abs=1e-4)
+
+
 def test_a_fleet_of_the_blind_generator():
     fault, of_type = Fault("wheel_load_offset:one", 600.0), Fault("drivetrain_loss:constant", 60.0)
     hidden = fleet(5, {1: fault}, of_type, vehicles=5, logs=1, seconds=40.0)
     names = names_given(hidden)
     assert {(one.effect, one.vehicle) for one in names} == {("drivetrain_loss", None), ("wheel_load_offset", 1)}
     assert all(is_true(one, hidden) for one in names)
+
+
+def test_what_logs_can_show_of_a_fault_depends_on_its_best_rival():
+    clear = rivalry(31, 0, Fault("wheel_load_offset:one", 500.0, 1))
+    assert clear.fall > 2.0 * clear.rival_fall > 0.0
+    assert clear.probability > 0.99
+    imitated = rivalry(31, 3, Fault("draft_offset:constant", 600.0, 1))
+    assert imitated.rival == "bulldozing"
+    assert imitated.fall > 300.0  # far better than nothing
+    assert abs(imitated.fall - imitated.rival_fall) < 3.0
+    assert max(imitated.probability, imitated.untempered) < 0.6
 
 
 def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):
@@ -115,3 +139,7 @@ def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):
     run("out", said.append)
     assert (out / "diagnosis.json").read_bytes() == before
     assert not any("diagnosed" in line for line in said)
+    os.utime(tmp_path / "logs/T1/a.log", (0, 0))  # another file for all that is known
+    run("out", said.append)
+    assert "1 of 1 vehicles diagnosed" in said
+    assert (out / "diagnosis.json").read_bytes() == before

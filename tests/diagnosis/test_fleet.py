@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities, onsets_of
+from soilbus.diagnosis.fleet import Onset, diagnose_vehicle, named, onset_probabilities, onsets_of
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.assembly import prior_of, rig_of, with_effects
 from soilbus.offline.fleet import judged
 from soilbus.offline.manoeuvre import record_of_recording
@@ -72,6 +73,49 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
         for wheel in rig_of(CONFIG).wheels:
             estimate = sizes[f"offset_{wheel}"]
             assert abs(estimate.value - wanted) < 4.0 * estimate.std + 60.0
+
+
+@pytest.mark.parametrize(("explained", "name"), [(700.0, "draft_gain"), (900.0, "grade")])
+def test_logs_that_contradict_each_other_are_diagnosed_apart_where_that_explains_more(explained, name, monkeypatch):
+    """-2 log evidence: 1000 for both logs together, 100 for each by itself; an effect that begins explains 50 more."""
+
+    def found(records, *_):
+        best, fall = ("grade", explained) if len(records) == 2 else ("draft_gain", 50.0)
+        addition = SimpleNamespace(effect=CATALOGUE[best], probability=0.9, alternatives={})
+        models = {"base": SimpleNamespace(neg2_log_evidence=fall), "completed": SimpleNamespace(neg2_log_evidence=0.0)}
+        return SimpleNamespace(additions=[addition], verdict=Verdict.NAMED, **models)
+
+    fakes = {
+        "diagnose": found,
+        "fit_model": lambda records, *_: SimpleNamespace(neg2_log_evidence=1000.0 if len(records) == 2 else 100.0),
+        "onsets_of": lambda *_: {},
+        "factors_of": lambda *_: {},
+    }
+    for function, fake in fakes.items():
+        monkeypatch.setattr(f"soilbus.diagnosis.fleet.{function}", fake)
+    logs = [SimpleNamespace(training=SimpleNamespace(effects=())) for _ in range(2)]
+    assert diagnose_vehicle(logs, None, []).probabilities == {name: 0.9}
+
+
+def test_logs_that_contradict_the_later_ones_stay_out_whatever_explains_these(monkeypatch):
+    """All logs together are explained by a wrong effect, those from the onset on by several that begin anywhere."""
+
+    def found(records, *_):
+        names = {"bulldozing": 0.999} if len(records) == 2 else {"grade": 0.4, "draft_offset": 0.4}
+        best, *others = names
+        alternatives = {name: names[name] for name in others}
+        addition = SimpleNamespace(effect=CATALOGUE[best], probability=names[best], alternatives=alternatives)
+        return SimpleNamespace(additions=[addition], verdict=Verdict.AMBIGUOUS)
+
+    def onsets(records, prior, of):
+        name = of.additions[0].effect.name
+        return {name: Onset(1, (0.0, 1.0), 0.0, ()) if name == "bulldozing" else Onset(0, (0.6, 0.4), 0.0, ())}
+
+    fakes = {"diagnose": found, "onsets_of": onsets, "factors_of": lambda *_: {}, "fit_model": lambda *_: None}
+    for name, fake in fakes.items():
+        monkeypatch.setattr(f"soilbus.diagnosis.fleet.{name}", fake)
+    logs = [SimpleNamespace(training=SimpleNamespace(effects=())) for _ in range(2)]
+    assert diagnose_vehicle(logs, None, []).probabilities == {"grade": 0.4, "draft_offset": 0.4}
 
 
 def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():

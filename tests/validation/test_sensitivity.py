@@ -7,22 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.diagnosis.options import DiagnosisOptions
+from soilbus.diagnosis.options import DiagnosisOptions, TypeOptions
 from soilbus.estimation.options import EstimatorOptions
 from soilbus.validation.sensitivity import Field, fields_of, with_field
 
 PAGE = Path(__file__).resolve().parents[2] / "service" / "docs" / "sensitivity.md"
-FIELDS = [*fields_of(EstimatorOptions()), *fields_of(DiagnosisOptions())]
+OPTIONS = (EstimatorOptions(), DiagnosisOptions(), TypeOptions())
+FIELDS = [(options, field) for options in OPTIONS for field in fields_of(options)]
 
 
 def test_the_page_has_every_value_and_no_other():
     rows = re.findall(r"^\| `(.+?)` \| (\S+) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    assert rows == [(".".join(field.path), f"{field.value:g}") for field in FIELDS]
+    assert rows == [(".".join(field.path), f"{field.value:g}") for _, field in FIELDS]
 
 
 def test_one_value_alone_is_changed():
-    for field in FIELDS:
-        options = EstimatorOptions() if field.path[0] in ("measurements", "search", "posterior") else DiagnosisOptions()
+    for options, field in FIELDS:
         changed = with_field(options, field.path, 7.0 * field.value)
         others = {f.path: f.value for f in fields_of(options) if f.path != field.path}
         assert {f.path: f.value for f in fields_of(changed)} == others | {field.path: 7.0 * field.value}

@@ -72,6 +72,11 @@ class OwnParameters(NamedTuple):
     information_vector: Array
     free: tuple[Free, ...]
 
+    def moments(self) -> tuple[Array, Array]:
+        """Posterior mean (P,) and covariance (P, P), in units of the prior std."""
+        covariance = np.asarray(np.linalg.inv(self.information + np.eye(len(self.free))), float)
+        return np.asarray(covariance @ self.information_vector), covariance
+
     def surcharge(self, temperature: float) -> float:
         """By how much more these parameters cost than their share of a -2 log evidence divided by a temperature.
 
@@ -79,16 +84,16 @@ class OwnParameters(NamedTuple):
         The penalty for having the parameters does not shrink in that proportion, but as their information does
         (coarsened posterior: Miller & Dunson 2019, J. Am. Stat. Assoc. 114:1113).
         """
-        return self._coarsened(temperature) - self._coarsened(1.0) / temperature
+        return self.neg2_log_evidence(temperature) - self.neg2_log_evidence() / temperature
 
     def surcharge_or_absent(self, temperature: float) -> float:
         """The same where the recording has them or not, each with probability 1/2."""
-        coarsened = self._coarsened(temperature)
+        coarsened = self.neg2_log_evidence(temperature)
         either = -2.0 * float(np.logaddexp(0.0, -0.5 * coarsened) - np.log(2.0))
-        return either - self._coarsened(1.0) / temperature
+        return either - self.neg2_log_evidence() / temperature
 
-    def _coarsened(self, temperature: float) -> float:
-        """-2 log evidence with a likelihood to the power of 1 / temperature."""
+    def neg2_log_evidence(self, temperature: float = 1.0) -> float:
+        """Relative to the absence of the parameters, with the likelihood to the power of 1 / temperature."""
         return mixture_neg2_log_evidence(
             self.information / temperature, self.information_vector / temperature, self.free
         )

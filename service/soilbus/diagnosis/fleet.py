@@ -132,12 +132,12 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
     NotFitted
         Where already the present model cannot be fitted.
     """
-    first, found = 0, diagnose(records, prior, catalogue)
+    first, found = _first_diagnosis(records, prior, catalogue)
     onsets = onsets_of(records, prior, found)
     for _ in range(MAX_ROUNDS):
         surest = max(onsets.values(), key=lambda onset: max(onset.probabilities), default=None)
         begin = first if surest is None else surest.first
-        if begin == first:
+        if begin <= first:  # the logs before contradicted those after: another effect's onset does not undo that
             break
         # one value of the effect for all logs was wrong: it belongs to those from its onset on
         first, found = begin, diagnose(records[begin:], prior, catalogue)
@@ -147,6 +147,37 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
     except np.linalg.LinAlgError:  # the vehicle then says nothing of its type
         factors = {}
     return VehicleDiagnosis(found, onsets, factors)
+
+
+def _first_diagnosis(records: Sequence[Record], prior: SoilPrior, catalogue: Sequence[Effect]) -> tuple[int, Diagnosis]:
+    """The diagnosis of all logs, or of those from a change of the vehicle on where that explains more; and the first.
+
+    A fault that begins lets the logs contradict each other under the present model, and no effect of one size explains
+    that: rather one that each log may have for itself.
+    """
+    found = diagnose(records, prior, catalogue)
+    if len(records) == 1 or found.verdict is Verdict.NONE:
+        return 0, found
+
+    def neg2_log_evidence(some: Sequence[Record]) -> float:
+        fitted = fit_model(some, prior, some[0].training.effects)
+        return np.inf if fitted is None else fitted.neg2_log_evidence
+
+    together = neg2_log_evidence(records)
+    apart = [neg2_log_evidence(records[:k]) + neg2_log_evidence(records[k:]) for k in range(1, len(records))]
+    if min(apart) >= together:
+        return 0, found
+    first = 1 + int(np.argmin(apart))
+    later = diagnose(records[first:], prior, catalogue)
+    explained = found.verdict is not Verdict.UNKNOWN or later.verdict is Verdict.UNKNOWN
+    if explained and together - _explained(found) <= min(apart) - _explained(later):
+        return 0, found
+    return first, later
+
+
+def _explained(found: Diagnosis) -> float:
+    """Fall of -2 log evidence by all effects added."""
+    return found.base.neg2_log_evidence - found.completed.neg2_log_evidence
 
 
 def diagnose_type(

@@ -24,8 +24,9 @@ from scipy.special import expit, logsumexp, softmax
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.diagnose import Diagnosis
-from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
+from soilbus.diagnosis.evidence import OwnParameters, own_parameters
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.options import TYPE_DEFAULT, TypeOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import joint_equations, normal_equations, scores
 from soilbus.diagnosis.verdict import temperature, temperature_of_all
@@ -43,20 +44,8 @@ __all__ = [
     "shared_effects",
 ]
 
-MIN_VEHICLES = 3
-"""Vehicles from which on a type is judged: with two, nothing says which one differs."""
-MAX_SHARED = 2
-"""Effects of a type at most; each costs a diagnosis of every vehicle."""
-LEAST_PROBABILITY = 0.5
-"""Probability from which the vehicles are diagnosed again with an effect of the type."""
-LEAST_LOG_EVIDENCE = 1.0
-"""Tempered log evidence [nat], odds of e, from which a vehicle shows an effect: sound vehicles scatter about zero."""
-MAX_LEAVING = 32
-"""One vehicle in this many leaves at a time; bounds the time of a large type."""
-LEAST_SHARE = 1e-6
-"""Probability below which a name, or nothing, is not taken to be: it is the rounding of a sum."""
-ROUNDS = 20
-"""Rounds of the shares of vehicles with each effect, which settle in a few."""
+ROUNDING = float(np.finfo(float).eps)
+"""Of a sum of probabilities, which are no surer than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,55 +189,61 @@ def records_with(records: Sequence[Record], effect: Effect, free: Sequence[Free]
 
 
 class Pool(NamedTuple):
-    """Likelihood of one value in several vehicles, each divided by a temperature; all in the same `free`.
+    """Likelihood of one value of an effect (P parameters) in each of V vehicles, divided by its temperature.
 
-    falls (V,) are those of -2 log evidence by a value each.
+    information (V, P, P) and vector (V, P) are as in OwnParameters; log_evidence (V,) is that of a value each less that
+    of the same likelihood, both relative to the effect's absence.
     """
 
-    parts: tuple[OwnParameters, ...]
-    falls: Array
-    divisors: Array
+    information: Array
+    vector: Array
+    log_evidence: Array
+    free: tuple[Free, ...]
 
     def sum(self, chosen: Sequence[int]) -> OwnParameters:
-        """Of the chosen vehicles together."""
-        information = np.sum([self.parts[i].information / self.divisors[i] for i in chosen], axis=0)
-        vector = np.sum([self.parts[i].information_vector / self.divisors[i] for i in chosen], axis=0)
-        return OwnParameters(information, vector, self.parts[0].free)
+        """Likelihood of the chosen vehicles together."""
+        return OwnParameters(self.information[chosen].sum(0), self.vector[chosen].sum(0), self.free)
 
-    def log_evidence(self, chosen: Sequence[int]) -> float:
-        """Of one value in the chosen vehicles, relative to the effect's absence."""
-        each = np.array([self.falls[i] + _neg2_log_evidence(self.parts[i]) for i in chosen])
-        return float(np.sum(each / self.divisors[list(chosen)]) - _neg2_log_evidence(self.sum(chosen))) / 2.0
+    def of_all(self, chosen: Sequence[int]) -> float:
+        """Log evidence of one value in the chosen vehicles, relative to the effect's absence."""
+        return float(self.log_evidence[chosen].sum()) - self.sum(chosen).neg2_log_evidence() / 2.0
 
-
-def _neg2_log_evidence(own: OwnParameters) -> float:
-    return mixture_neg2_log_evidence(own.information, own.information_vector, own.free)
+    def of_each(self, chosen: Sequence[int]) -> Array:
+        """Log evidence (of the chosen) that each adds to the others."""
+        information, vector, _ = whole = self.sum(chosen)
+        others = [OwnParameters(information - self.information[i], vector - self.vector[i], self.free) for i in chosen]
+        shared = np.array([each.neg2_log_evidence() for each in others]) - whole.neg2_log_evidence()
+        return np.asarray(self.log_evidence[chosen] + shared / 2.0)
 
 
 def shared_effects(
     effects: Mapping[str, Effect],
     n_wheels: int,
     factors_beside: Callable[[tuple[SharedEffect, ...]], Sequence[Mapping[str, Factor]]],
+    options: TypeOptions = TYPE_DEFAULT,
 ) -> tuple[SharedEffect, ...]:
     """The effects that a type has, one after the other.
 
     Parameters
     ----------
-    effects, n_wheels
+    effects, n_wheels, options
         As of shared_effect().
     factors_beside
         Diagnoses every vehicle beside effects of the type; gives their factors.
     """
     found: tuple[SharedEffect, ...] = ()
     vehicles = factors_beside(found)
-    while len(found) < MAX_SHARED and (one := shared_effect(effects, vehicles, n_wheels)) is not None:
+    while (one := shared_effect(effects, vehicles, n_wheels, options)) is not None:
         found = (*found, one)
         vehicles = factors_beside(found)
     return found
 
 
 def shared_effect(
-    effects: Mapping[str, Effect], vehicles: Sequence[Mapping[str, Factor]], n_wheels: int
+    effects: Mapping[str, Effect],
+    vehicles: Sequence[Mapping[str, Factor]],
+    n_wheels: int,
+    options: TypeOptions = TYPE_DEFAULT,
 ) -> SharedEffect | None:
     """The effect that the vehicles of a type share, the most probable one.
 
@@ -260,6 +255,8 @@ def shared_effect(
         Of each vehicle of the type, the factors by name; {} of one that says nothing.
     n_wheels
         Of a vehicle.
+    options
+        Of the judgement.
 
     Returns
     -------
@@ -267,45 +264,40 @@ def shared_effect(
         None where the vehicles' own effects, or none, explain as much.
     """
     usable = [v for v, factors in enumerate(vehicles) if factors]
-    if len(usable) < MIN_VEHICLES:
-        return None
-    found = _most_probable([vehicles[v] for v in usable])
+    found = _most_probable([vehicles[v] for v in usable], options) if len(usable) >= options.min_vehicles else None
     if found is None:
         return None
     name, pool, chosen, p = found
-    free, members = parameters_of(effects[name], n_wheels), [usable[i] for i in chosen]
-    given = []
-    for v in range(len(vehicles)):
-        others = [i for i in chosen if usable[i] != v]
-        given.append(_given(free, pool.sum(others)))
-    common = {f.name for f in pool.parts[0].free}
+    free = parameters_of(effects[name], n_wheels)
+    members = {usable[i]: i for i in chosen}
+    given = [_given(free, pool.sum([i for member, i in members.items() if member != v])) for v in range(len(vehicles))]
+    common = {f.name for f in pool.free}
     values = [f for f in _given(free, pool.sum(chosen)) if f.name in common]
     parameters = {f.name.removeprefix(f"{name}."): Estimate(f.value, f.std) for f in values}
     return SharedEffect(effects[name], p, tuple(members), parameters, tuple(given))
 
 
-def _most_probable(vehicles: Sequence[Mapping[str, Factor]]) -> tuple[str, Pool, list[int], float] | None:
-    """Name, factors, vehicles that agree, and probability."""
-    names = len(set.union(*(set(factors) for factors in vehicles)))
-    pools: dict[str, Pool] = {}
-    agreeing: dict[str, list[int]] = {}
-    gains: dict[str, float] = {}
-    for name in sorted(set.union(*(set(factors) for factors in vehicles))):
+def _most_probable(
+    vehicles: Sequence[Mapping[str, Factor]], options: TypeOptions
+) -> tuple[str, Pool, list[int], float] | None:
+    """Name, likelihoods, vehicles that agree, and probability; None where nothing is more probable than not."""
+    names = sorted(set.union(*(set(factors) for factors in vehicles)))
+    found: dict[str, tuple[float, Pool, list[int]]] = {}
+    for name in names:
         shown = [v for v, factors in enumerate(vehicles) if name in factors]
         pool, own = _pool(name, vehicles), np.zeros(len(vehicles))
-        if not pool.parts[0].free:
-            continue
         own[shown] = _own_log_evidence(name, [vehicles[v] for v in shown])
-        chosen = _agreeing(pool, own, shown)
+        chosen = _agreeing(pool, own, shown, options) if pool.free else None
         if chosen is not None:
-            pools[name], agreeing[name] = pool, chosen
             # any effect of the catalogue may be the type's, each as likely beforehand as another
-            gains[name] = pool.log_evidence(chosen) - float(own[chosen].sum()) - math.log(names)
-    if not gains:
+            log_odds = pool.of_all(chosen) - float(own[chosen].sum()) - math.log(len(names))
+            found[name] = log_odds, pool, chosen
+    if not found:
         return None
-    best = max(gains, key=lambda name: gains[name])
-    p = _name_probability(best, [vehicles[v] for v in agreeing[best]]) * float(expit(gains[best]))
-    return (best, pools[best], agreeing[best], p) if p >= LEAST_PROBABILITY else None
+    best = max(found, key=lambda name: found[name][0])
+    log_odds, pool, chosen = found[best]
+    p = _name_probability(best, [vehicles[v] for v in chosen]) * float(expit(log_odds))
+    return (best, pool, chosen, p) if p >= 0.5 else None
 
 
 def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
@@ -314,69 +306,62 @@ def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> fl
     At the temperature of all their recordings together, as a formula that is off is off in all of them.
     """
     places = [factors[best] for factors in vehicles]
-    pools: dict[str, Pool] = {}
+    divisor = temperature_of_all([place.divisor for place in places])
+    log_evidence: dict[str, float] = {}
     for name in sorted({rival for place in places for rival in place.falls}):
         here = [
-            {name: replace(factors[name], falls=place.falls)} if name in factors and name in place.falls else {}
+            {name: Factor(place.falls, divisor, factors[name].own)} if name in factors and name in place.falls else {}
             for factors, place in zip(vehicles, places, strict=True)
         ]
-        if any(here):
-            pool = _pool(name, here)
-            pools |= {name: pool} if pool.parts[0].free else {}
-    divisors = np.full(len(vehicles), temperature_of_all([place.divisor for place in places]))
-    chances = softmax([pool._replace(divisors=divisors).log_evidence(range(len(vehicles))) for pool in pools.values()])
-    return float(chances[list(pools).index(best)])
+        pool = _pool(name, here) if any(here) else None
+        if pool is not None and pool.free:
+            log_evidence[name] = pool.of_all(range(len(vehicles)))
+    return float(softmax(list(log_evidence.values()))[list(log_evidence).index(best)])
 
 
 def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
     """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral."""
-    factors = [of_vehicle.get(name) for of_vehicle in vehicles]
-    common = set.intersection(*({f.name for f in factor.own.free} for factor in factors if factor is not None))
-    known = {v: _marginal(factor.own, common) for v, factor in enumerate(factors) if factor is not None}
-    P, free = len(common), next(iter(known.values())).free
-    nothing = OwnParameters(np.zeros((P, P)), np.zeros(P), free)
-    falls = [0.0 if factor is None else factor.falls[name] for factor in factors]
-    divisors = [1.0 if factor is None else factor.divisor for factor in factors]
-    return Pool(tuple(known.get(v, nothing) for v in range(len(factors))), np.array(falls), np.array(divisors))
+    factors = {v: of_vehicle[name] for v, of_vehicle in enumerate(vehicles) if name in of_vehicle}
+    common = set.intersection(*({f.name for f in factor.own.free} for factor in factors.values()))
+    V, P = len(vehicles), len(common)
+    information, vector, log_evidence = np.zeros((V, P, P)), np.zeros((V, P)), np.zeros(V)
+    free: tuple[Free, ...] = ()
+    for v, factor in factors.items():
+        own = _marginal(factor.own, common)
+        log_evidence[v] = (factor.falls[name] + own.neg2_log_evidence()) / factor.divisor / 2.0
+        information[v], vector[v] = own.information / factor.divisor, own.information_vector / factor.divisor
+        free = own.free
+    return Pool(information, vector, log_evidence, free)
 
 
 def _marginal(own: OwnParameters, names: set[str]) -> OwnParameters:
     kept = [i for i, f in enumerate(own.free) if f.name in names]
-    posterior = np.linalg.inv(own.information + np.eye(len(own.free)))
-    precision = np.linalg.inv(posterior[np.ix_(kept, kept)])
-    vector = precision @ (posterior @ own.information_vector)[kept]
-    return OwnParameters(precision - np.eye(len(kept)), vector, tuple(own.free[i] for i in kept))
+    mean, covariance = own.moments()
+    return own_parameters(mean[kept], covariance[np.ix_(kept, kept)], [own.free[i] for i in kept])
 
 
-def _agreeing(pool: Pool, own: Array, shown: Sequence[int]) -> list[int] | None:
+def _agreeing(pool: Pool, own: Array, shown: Sequence[int], options: TypeOptions) -> list[int] | None:
     """The vehicles that one value explains better than effects of their own; None where these are not most of all.
 
     Most must show the effect too: with the value of the others it explains something in them.  shown are those whose
     logs say something of the effect.
     """
-    V = len(pool.parts)
+
+    def are_most(vehicles: Sequence[int]) -> bool:
+        return 2 * len(vehicles) > len(own) and len(vehicles) >= options.min_vehicles
+
     chosen = list(shown)
-    while _are_most(chosen, V):
-        whole = pool.log_evidence(chosen)
-        gains = np.array([whole - pool.log_evidence([j for j in chosen if j != i]) for i in chosen])
-        worse = gains - own[chosen]
-        if worse.min() >= 0.0:
-            break
-        leaving = {chosen[k] for k in np.argsort(worse)[: 1 + V // MAX_LEAVING] if worse[k] < 0.0}
-        chosen = [i for i in chosen if i not in leaving]
-    else:
+    at_once = 1 + int(options.left_out_share * len(own))
+    while are_most(chosen) and (worse := pool.of_each(chosen) - own[chosen]).min() < 0.0:
+        left_out = {chosen[k] for k in np.argsort(worse)[:at_once] if worse[k] < 0.0}
+        chosen = [i for i in chosen if i not in left_out]
+    if not are_most(chosen):
         return None
-    whole = pool.log_evidence(chosen)  # a vehicle may have left on account of another that left after it
-    back = [i for i in shown if i not in chosen and pool.log_evidence([*chosen, i]) - whole >= own[i]]
+    whole = pool.of_all(chosen)  # a vehicle may be left out on account of another that was left out after it
+    back = [i for i in shown if i not in chosen and pool.of_all([*chosen, i]) - whole >= own[i]]
     chosen = sorted([*chosen, *back])
-    whole = pool.log_evidence(chosen)
-    others = [pool.log_evidence([j for j in chosen if j != i]) for i in chosen]
-    showing = [i for i, without in zip(chosen, others, strict=True) if whole - without > LEAST_LOG_EVIDENCE]
-    return chosen if _are_most(showing, V) else None
-
-
-def _are_most(chosen: Sequence[int], vehicles: int) -> bool:
-    return 2 * len(chosen) > vehicles and len(chosen) >= MIN_VEHICLES
+    showing = [i for i, adds in zip(chosen, pool.of_each(chosen), strict=True) if adds > options.shown_log_evidence]
+    return chosen if are_most(showing) else None
 
 
 def _own_log_evidence(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Array:
@@ -385,39 +370,47 @@ def _own_log_evidence(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Ar
     A value of its own is paid in full in each vehicle: data divided by a temperature tell it less well (see
     OwnParameters.surcharge).
     """
-    names = sorted({rival for factors in vehicles for rival in factors[name].falls})
-    log_odds = np.full((len(vehicles), len(names)), -np.inf)
-    for v, factors in enumerate(vehicles):
+    places = []
+    for factors in vehicles:
         here = factors[name]
-        for rival, fall in here.falls.items():
-            own = factors.get(rival, here).own
-            log_odds[v, names.index(rival)] = (fall / here.divisor - own.surcharge(here.divisor)) / 2.0
-    nothing, each = _shares(log_odds, np.arange(len(vehicles)))
-    return np.asarray(logsumexp(np.column_stack([np.log(nothing), log_odds + np.log(each)]), axis=1))
+        own = {rival: factors.get(rival, here).own.surcharge(here.divisor) for rival in here.falls}
+        places.append({rival: (fall / here.divisor - own[rival]) / 2.0 for rival, fall in here.falls.items()})
+    log_odds, _ = _columns(places)
+    return np.asarray(logsumexp(log_odds + np.log(_shares(log_odds, np.arange(len(vehicles)))), axis=1))
 
 
-def _shares(log_odds: Array, vehicle: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Probability of nothing (R,) and of each effect (R, K), in each place, as those of other vehicles show them.
+def _columns(places: Sequence[Mapping[str, float]], names: int = 0) -> tuple[Array, list[str]]:
+    """Log odds (R, 1 + K) of nothing and of each name, relative to nothing, and the names; at least so many columns."""
+    columns = sorted({name for place in places for name in place})
+    log_odds = np.full((len(places), 1 + max(names, len(columns))), -np.inf)
+    log_odds[:, 0] = 0.0
+    for row, place in zip(log_odds, places, strict=True):
+        row[[1 + columns.index(name) for name in place]] = list(place.values())
+    return log_odds, columns
+
+
+def _shares(log_odds: Array, vehicle: NDArray[np.intp]) -> Array:
+    """Probability (R, 1 + K) of nothing and of each effect, in each place, as those of other vehicles show them.
 
     Parameters
     ----------
-    log_odds : (R, K)
-        Log evidence of each effect relative to nothing, in each place for an effect.
+    log_odds : (R, 1 + K)
+        Log evidence of nothing and of each effect, relative to nothing, in each place for an effect.
     vehicle : (R,)
         Of each place.
     """
-    R, K = log_odds.shape
-    elsewhere = (vehicle[:, None] != vehicle).astype(float)
-    nothing, each = np.full(R, 0.5), np.full((R, K), 0.5 / K)
-    for _ in range(ROUNDS):
-        log_joint = np.column_stack([np.log(nothing), log_odds + np.log(each)])
-        posterior = np.exp(log_joint - logsumexp(log_joint, axis=1, keepdims=True))
-        others = elsewhere @ posterior
-        with_one = others[:, 1:].sum(1)
-        something = (with_one + 1.0) / (others.sum(1) + 2.0)
-        nothing = 1.0 - something
-        each = something[:, None] * (others[:, 1:] + 1.0) / (with_one + K)[:, None]
-    return nothing, each
+    R, K = len(log_odds), log_odds.shape[1] - 1
+    shares, before = np.full((R, 1 + K), 0.5 / K), np.zeros((R, 1 + K))
+    shares[:, 0] = 0.5
+    while not np.allclose(shares, before, equal_nan=True):
+        posterior, before = softmax(log_odds + np.log(shares), axis=1), shares
+        of_vehicle = np.zeros((R, 1 + K))  # each vehicle has a place
+        np.add.at(of_vehicle, vehicle, posterior)
+        others = np.maximum(of_vehicle.sum(0) - of_vehicle[vehicle], 0.0)
+        with_one = others[:, 1:].sum(1, keepdims=True)
+        something = (with_one + 1.0) / (others.sum(1, keepdims=True) + 2.0)
+        shares = np.hstack([1.0 - something, something * (others[:, 1:] + 1.0) / (with_one + K)])
+    return shares
 
 
 def own_probabilities(found: Sequence[Sequence[Mapping[str, float]]], names: int) -> list[list[dict[str, float]]]:
@@ -438,27 +431,24 @@ def own_probabilities(found: Sequence[Sequence[Mapping[str, float]]], names: int
     """
     # a vehicle that shows nothing counts as one place with nothing in it
     places = [(v, place) for v, of_vehicle in enumerate(found) for place in (of_vehicle or [{}])]
-    columns = sorted({name for _, place in places for name in place})
-    K = max(names, len(columns))
-    log_odds = np.full((len(places), K), -np.inf)
-    for r, (_, place) in enumerate(places):
-        nothing = max(1.0 - sum(place.values()), LEAST_SHARE)
-        for name, p in place.items():
-            log_odds[r, columns.index(name)] = np.log(max(p, LEAST_SHARE) / nothing * K)
-    none, share = _shares(log_odds, np.array([v for v, _ in places]))
-    log_joint = np.column_stack([np.log(none), log_odds + np.log(share)])
-    posterior = np.exp(log_joint - logsumexp(log_joint, axis=1, keepdims=True))[:, 1:]
+    odds = []
+    for _, place in places:
+        nothing = max(1.0 - sum(place.values()), ROUNDING)
+        odds.append({name: math.log(max(p, ROUNDING) / nothing * names) for name, p in place.items()})
+    log_odds, columns = _columns(odds, names)
+    shares = _shares(log_odds, np.array([v for v, _ in places], int))
+    posterior = softmax(log_odds + np.log(shares), axis=1)[:, 1:]
     out: list[list[dict[str, float]]] = [[] for _ in found]
-    for r, (v, place) in enumerate(places):
+    for (v, place), of_place in zip(places, posterior, strict=True):
         if place:
-            out[v].append({name: float(posterior[r, columns.index(name)]) for name in place})
+            out[v].append({name: float(of_place[columns.index(name)]) for name in place})
     return out
 
 
 def _given(parameters: Sequence[Free], likelihood: OwnParameters) -> tuple[Free, ...]:
     """An effect's parameters with the posterior by a likelihood as prior."""
-    covariance = np.linalg.inv(likelihood.information + np.eye(len(likelihood.free)))
-    mean, sd = covariance @ likelihood.information_vector, np.sqrt(np.diag(covariance))
+    mean, covariance = likelihood.moments()
+    sd = np.sqrt(np.diag(covariance))
     at = {f.name: i for i, f in enumerate(likelihood.free)}
     return tuple(
         replace(f, value=f.at(float(mean[at[f.name]])), std=f.std * float(sd[at[f.name]])) if f.name in at else f

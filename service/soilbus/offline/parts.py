@@ -83,6 +83,8 @@ class Job:
         Time [s] of the first sample, for logs whose stamps are no dates; None: stamps count as they are.
     content
         The log itself, where workers do not see the file.
+    not_sent
+        Why it was not sent along, in one line, where workers do not see the file.
     """
 
     log: str
@@ -90,6 +92,7 @@ class Job:
     setup: Setup
     start: float | None = None
     content: bytes | None = field(default=None, repr=False)
+    not_sent: str | None = field(default=None, repr=False)
 
     @property
     def digest(self) -> str:
@@ -240,9 +243,11 @@ def local_log(job: Job) -> Iterator[Path]:
     Raises
     ------
     LogError
-        The URL cannot be read.
+        The URL cannot be read, or the log is neither here nor was it sent along.
     """
     if job.content is None and "://" not in job.log:
+        if job.not_sent is not None and not Path(job.log).exists():
+            raise LogError(job.not_sent)
         yield Path(job.log)
         return
     with TemporaryDirectory(prefix="soilbus-") as folder:

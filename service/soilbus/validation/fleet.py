@@ -4,6 +4,12 @@
     false     any other effect named
     found     hidden faults that are named, and the faulty vehicle's own effects by the log from which on they are there
 
+`--rivals` says instead what the logs with a fault, alone, can show of it at all:
+
+    P <= 1 / (1 + exp(-(F - F') / 2 T)),   F, F': fall of -2 log evidence by the hidden effect and by the best other one
+
+with T the temperature of `diagnosis.verdict`, and with T = 1, as if the formulas were those of the field.
+
 Each vehicle drives logs on soils of its own, with sensor gains of its own.  Effects are in the formulas of
 `soilbus.validation.blind`, in other ones than the catalogue's where these differ; the diagnosis is the real one.
 """
@@ -17,9 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.diagnosis.diagnose import of_vehicle
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.fleet import by_name, diagnose_type, named
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.vehicle_type import own_probabilities
+from soilbus.diagnosis.verdict import probabilities, temperature
 from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.report.table import table
@@ -85,21 +94,22 @@ def fleet(
     for v in range(vehicles):
         records = []
         for log in range(logs):
-            hidden = [shared] if shared else []
-            if v in faults and log >= faults[v].first:
-                hidden.append(faults[v])
-            records.append(_record(seed, v, log, hidden, seconds))
+            own = faults[v] if v in faults and log >= faults[v].first else None
+            records.append(_record(seed, v, log, own, shared, seconds))
         all_records.append(tuple(records))
     return Fleet(tuple(all_records), faults, shared)
 
 
-def _record(seed: int, vehicle: int, log: int, hidden: Sequence[Fault], seconds: float) -> Record:
+def _record(
+    seed: int, vehicle: int, log: int, own: Fault | None, shared: Fault | None = None, seconds: float = SECONDS
+) -> Record:
     config, rng = reference_configuration(), np.random.default_rng([seed, vehicle, log])
     name = str(rng.choice(SOILS))
     soil, forms = soil_named(name), {form.title: form for form in FORMS}
-    # what a form draws for itself, such as a sign, is the vehicle's
-    setting = Setting(soil, plain_sinkage(soil), np.random.default_rng([seed, vehicle]))
-    how = together([forms[one.form].hide(one.size, setting) for one in hidden])
+    # what a form draws for itself, such as a sign, is the type's or the vehicle's
+    drawn = ((shared, [seed]), (own, [seed, vehicle]))
+    settings = [(one, Setting(soil, plain_sinkage(soil), np.random.default_rng(of))) for one, of in drawn if one]
+    how = together([forms[one.form].hide(one.size, setting) for one, setting in settings])
     x = np.cumsum(np.concatenate([[0.0], rng.uniform(12.0, 25.0, 20)]))
     slope = rng.uniform(-0.04, 0.04, len(x))
     drive = Scenario(
@@ -141,12 +151,63 @@ def of_type(name: str) -> tuple[Fault, ...]:
     return tuple(Fault(form.title, form.size("medium", with_sinkage=True)) for form in forms)
 
 
-def fleet_of(seed: int, shared: Sequence[Fault]) -> Fleet:
-    """Three vehicles with faults by turns, and one of these effects of the type by turns; or none."""
+def faults_of(seed: int) -> dict[int, Fault]:
+    """Three vehicles with faults by turns."""
     rng = np.random.default_rng([seed, 7])
     kinds = [FAULTS[i] for i in rng.choice(len(FAULTS), 3, replace=False)]
-    who = rng.choice(VEHICLES, 3, replace=False).tolist()
-    return fleet(seed, dict(zip(who, kinds, strict=True)), shared[seed % len(shared)] if shared else None)
+    return dict(zip(rng.choice(VEHICLES, 3, replace=False).tolist(), kinds, strict=True))
+
+
+def fleet_of(seed: int, shared: Sequence[Fault]) -> Fleet:
+    """Three vehicles with faults, and one of these effects of the type by turns; or none."""
+    return fleet(seed, faults_of(seed), shared[seed % len(shared)] if shared else None)
+
+
+class Rivalry(NamedTuple):
+    """What the logs that have a fault, which is all that is hidden in them, show of it.
+
+    excess is that of the squared residuals without any effect; fall and rival_fall are of -2 log evidence, by the
+    effect and by the best other one; probability and untempered are of its name, with T as it is and with T = 1.
+    """
+
+    excess: float
+    fall: float
+    rival: str
+    rival_fall: float
+    probability: float
+    untempered: float
+
+
+def rivalry(seed: int, vehicle: int, fault: Fault) -> Rivalry:
+    """One vehicle's fault beside each effect of the catalogue in its place."""
+    config = reference_configuration()
+    prior = prior_of(config)
+    records = [_record(seed, vehicle, log, fault) for log in range(fault.first, LOGS)]
+    base = fit_model(records, prior, ())
+    assert base is not None
+    falls: dict[str, float] = {}
+    for effect in possible_effects(config):
+        if effect.base_law in (None, records[0].training.model.shear_law):
+            one = of_vehicle(effect, records)
+            fitted = fit_model(records, prior, [one], base.as_starts([one]))
+            if fitted is not None:
+                falls[one.name] = base.neg2_log_evidence - fitted.neg2_log_evidence
+    name = fault.effect
+    rival = max(falls.keys() - {name}, key=lambda other: falls[other])
+    chances = [probabilities(falls, divisor)[name] for divisor in (temperature(base.excess), 1.0)]
+    return Rivalry(base.excess, falls[name], rival, falls[rival], *chances)
+
+
+def print_rivals(seeds: Sequence[int]) -> None:
+    """A row for each fault of these fleets."""
+    rows = []
+    for seed in seeds:
+        for vehicle, fault in sorted(faults_of(seed).items()):
+            one = rivalry(seed, vehicle, fault)
+            falls = f"{one.fall:.1f}", f"{one.rival} {one.rival_fall:.1f}"
+            chances = f"{one.probability:.2f}", f"{one.untempered:.2f}"
+            rows.append((str(seed), str(vehicle), fault.form, f"{one.excess:.0f}", *falls, *chances))
+    print(table(("seed", "vehicle", "fault", "excess", "fall", "best other effect", "P", "P at T = 1"), rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -158,7 +219,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--fleets", type=int, default=2, help="fleets of each kind (2)")
     parser.add_argument("--type-effect", metavar="NAME", help="of the type, in its forms by turns (drivetrain_loss)")
     parser.add_argument("--only-shared", action="store_true", help="no fleets without an effect of the type")
+    parser.add_argument("--rivals", action="store_true", help="what the logs with each fault can show of it at all")
     chosen = parser.parse_args(arguments)
+    if chosen.rivals:
+        print_rivals(range(chosen.seed, chosen.seed + chosen.fleets))
+        return 0
     try:
         shared = of_type(chosen.type_effect) if chosen.type_effect else SHARED
     except ValueError as error:

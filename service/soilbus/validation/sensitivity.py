@@ -4,10 +4,12 @@
                  windows whose status changes,  change of the evaluations of the fits [%]
     diagnosis    cases whose verdict or names change,  greatest change of a name's probability,
                  greatest |change of log pressure| / sd,  change of the model evaluations [%]
+    types        types that get or lose an effect, types of which other vehicles agree, greatest change of a probability
 
 Each field of the options is multiplied by 0.7 and by 1.3, counts rounded and changed by at least one, on fixed seeded
-drives and cases (`estimates`, `diagnoses`).  A field of the solver is changed in the joint descent from a cold start,
-and in other descents where they have a value of their own.  `--page` writes the table of service/docs/sensitivity.md.
+drives, cases and types of vehicles (`estimates`, `diagnoses`, `types`).  A field of the solver is changed in the joint
+descent from a cold start, and in other descents where they have a value of their own.  `--page` writes the tables of
+service/docs/sensitivity.md.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, partial
 from inspect import getsource
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,10 +33,14 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.diagnosis import options as of_diagnosis
 from soilbus.diagnosis.diagnose import NotFitted, diagnose
-from soilbus.diagnosis.options import DiagnosisOptions
+from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
+from soilbus.diagnosis.options import DiagnosisOptions, TypeOptions
 from soilbus.diagnosis.records import Record, TooLittle, record_of
+from soilbus.diagnosis.vehicle_type import Factor, SharedEffect, shared_effect
+from soilbus.diagnosis.verdict import temperature
 from soilbus.estimation import options as of_estimator
 from soilbus.estimation.assembly import model_of, possible_effects, prior_of, rig_of
+from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.options import EstimatorOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.tracker import Tracker
@@ -43,6 +50,7 @@ from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.validation.blind.cases import Case, cases
 from soilbus.validation.curved_drives import curved
@@ -66,6 +74,11 @@ CASES: Mapping[str, Sequence[str]] = {
 }  # fmt: skip
 """Beginnings of the ids of blind cases of seed 501, and their candidates where not all: these take long.  The last one
 is diagnosed as two recordings of one vehicle."""
+
+
+GAIN = CATALOGUE["draft_gain"]
+TYPES = tuple(product((2, 3, 8, 40), (0.0, 0.2, 0.45), (0.0, 0.02, 0.1), (0.004, 0.03)))
+"""Arguments of `factors_of_type`: few vehicles and many, equal and unequal ones, a clear value and a small one."""
 
 
 class Field(NamedTuple):
@@ -280,6 +293,45 @@ def change_of_diagnoses(before: Sequence[Diagnosed], after: Sequence[Diagnosed])
     )  # fmt: skip
 
 
+def types(options: TypeOptions) -> list[SharedEffect | None]:
+    """What each type of vehicles shares."""
+    return [shared_effect({GAIN.name: GAIN}, factors_of_type(*one), 4, options) for one in TYPES]
+
+
+def factors_of_type(vehicles: int, share_of_own: float, value: float, std: float) -> list[dict[str, Factor]]:
+    """What a load cell's gain [1] is by the logs of each vehicle: the type's value, or one of its own.
+
+    Parameters
+    ----------
+    vehicles
+        Of the type.
+    share_of_own
+        Expected share of them with a value of their own.
+    value, std
+        Of the others, and of what the logs of one say of it.
+    """
+    rng = np.random.default_rng([vehicles, *(round(1e4 * each) for each in (share_of_own, value, std))])
+    free = tuple(parameters_of(GAIN, 4))
+    information = np.array([[(free[0].std / std) ** 2]])
+    factors = []
+    for _ in range(vehicles):
+        true = 0.15 * rng.normal() if rng.random() < share_of_own else value
+        own = OwnParameters(information, information @ [(true + std * rng.normal()) / free[0].std], free)
+        fall = -mixture_neg2_log_evidence(own.information, own.information_vector, free)
+        factors.append({GAIN.name: Factor({GAIN.name: fall}, temperature(0.0), own)})
+    return factors
+
+
+def change_of_types(before: Sequence[SharedEffect | None], after: Sequence[SharedEffect | None]) -> str:
+    """What moved, in a few words; empty where nothing did."""
+    both = [(a, b) for a, b in zip(before, after, strict=True) if a is not None and b is not None]
+    found = sum((a is None) != (b is None) for a, b in zip(before, after, strict=True))
+    chance = max((abs(a.probability - b.probability) for a, b in both), default=0.0)
+    return _words(
+        (found, "{} found"), (sum(a.vehicles != b.vehicles for a, b in both), "{} vehicles"), (chance, "p {:.2f}")
+    )
+
+
 def _words(*figures: tuple[float, str]) -> str:
     """The figures that do not round to zero, as they are printed."""
     texts = [text.format(value) for value, text in figures]
@@ -301,6 +353,7 @@ def rows(
 TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Callable[[Any, Any], str]], ...] = (
     ("estimator", EstimatorOptions(), estimates, change_of_estimates),
     ("diagnosis", DiagnosisOptions(), diagnoses, change_of_diagnoses),
+    ("types", TypeOptions(), types, change_of_types),
 )
 """Name, options, what they are tried on, and how two results are compared."""
 
