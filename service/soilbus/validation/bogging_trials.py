@@ -41,8 +41,6 @@ from soilbus.validation.windows import task_of, torque_limits
 
 HALVES = ("report", "tune")
 """Drives by the parity of their seeds: even ones are reported, odd ones serve to set thresholds."""
-LOOK_PERIOD = 0.1
-"""Time [s] between two looks of the watch, as in the service."""
 MIN_LEAD_TIME, MIN_LEAD_DISTANCE = 3.0, 3.0
 """Lead of a warning that is early enough: [s], or [m] for the second one."""
 REACTION_TIME = 1.0
@@ -240,7 +238,7 @@ def _looks_and_curves(
     """What is seen until the end [s], and from their times on the curves of windows."""
     rig, settings = rig_of(config), config.estimator
     estimator, limit = WindowEstimator(config), torque_limits(config, rig)
-    store = Bins(rig, LOOK_PERIOD, 0.0)
+    store = Bins(rig, settings.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():
