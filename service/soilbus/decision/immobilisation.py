@@ -79,8 +79,6 @@ STEADY_RISE = 0.003
 and slope, beyond which they may become too much (while also given, for a vehicle that slows down gives less)."""
 WARNING_HOLD = 5.0
 """Time [s] after its last cause at which the warning ends."""
-BINS_OF_A_MOMENT = 3
-"""Bins of a window over which a moment's slip and pull are averaged."""
 
 
 class Alert(StrEnum):
@@ -393,8 +391,8 @@ class Warnings(NamedTuple):
         return self if self.since is not None else Warnings(t, (*self.begun, t))
 
 
-def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], min_speed: float) -> Iterator[Moment]:
-    """Means of slip and pull over BINS_OF_A_MOMENT bins, one at each of some bins.
+def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], bins: int, min_speed: float) -> Iterator[Moment]:
+    """The mean slip and pull over the last bins at each of some bins.
 
     Parameters
     ----------
@@ -404,6 +402,8 @@ def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], min_speed: float
         With a chassis, else there are no moments.
     chosen
         (M,), the bins at which each mean ends.
+    bins
+        Over how many each mean goes, fewer at the window's begin (`traction_loss.bins_of_a_moment`).
     min_speed
         [m/s], ground speed up to which slip is nan.
     """
@@ -412,7 +412,7 @@ def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], min_speed: float
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
     of_bins = np.column_stack([slip[:, rig.drives], pull_given(window, rig.chassis), inertia_of(window, rig.chassis)])
-    place = chosen[:, None] + np.arange(1 - BINS_OF_A_MOMENT, 1)
+    place = chosen[:, None] + np.arange(1 - bins, 1)
     there = place >= 0
     total = np.where(there[:, :, None], of_bins[np.maximum(place, 0)], 0.0).sum(axis=1)
     means = total / there.sum(axis=1)[:, None]

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 LONGEST_GAP = 1.0
 """Silence [s] after which durations are counted from zero."""
+MOMENT_SPAN = 0.3
+"""Time [s] over which a moment's slip and pull are averaged: half a period of loads that shake at 1.5 to 3 Hz."""
 
 
 class Motion(NamedTuple):
@@ -293,6 +295,11 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     bins = len(window.t)
     found = motions(window, rig, torque_limit, settings, np.arange(bins)[-1:], bins)
     return found[0] if found else None
+
+
+def bins_of_a_moment(bin_length: float) -> int:
+    """Number of bins of a length [s] over which a moment's means go."""
+    return max(round(MOMENT_SPAN / bin_length), 1)
 
 
 def motions(

@@ -21,7 +21,6 @@ from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
 from soilbus.decision.immobilisation import (
-    BINS_OF_A_MOMENT,
     Alert,
     Warnings,
     Watch,
@@ -33,7 +32,7 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import NO_LOSS, idle, motions, observed, slope_felt
+from soilbus.decision.traction_loss import NO_LOSS, bins_of_a_moment, idle, motions, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
@@ -259,10 +258,9 @@ class WindowEstimator:
         since = -math.inf if window.fresh else window.result.t - self._settings.hop
         driven = window.driven
         settings, chosen = self._settings, np.flatnonzero(driven.t > since)
-        looks = moments(driven, self.rig, chosen, settings.min_speed)
-        lately = motions(
-            driven, self.rig, window.torque_limit, self.config.traversability, chosen, BINS_OF_A_MOMENT
-        )  # fmt: skip
+        bins = bins_of_a_moment(settings.bin)
+        looks = moments(driven, self.rig, chosen, bins, settings.min_speed)
+        lately = motions(driven, self.rig, window.torque_limit, self.config.traversability, chosen, bins)
         for moment, motion in zip(looks, lately, strict=True):
             self._loss = observed(self._loss, motion, self.config)
             inertia = moment.inertia - slope_felt(self._loss, self.rig)

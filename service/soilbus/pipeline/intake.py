@@ -25,7 +25,7 @@ from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
-from soilbus.decision.traction_loss import Motion, motion_of
+from soilbus.decision.traction_loss import MOMENT_SPAN, Motion, motion_of
 from soilbus.estimation.assembly import Motor, Motors, delays_of, motors_of, rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
@@ -44,8 +44,6 @@ COVERAGE_BLOCK = 0.5
 """Time [s] of a block that counts as covered if it has a sample.  No evidence recorded."""
 MIN_COVERAGE = 0.95
 """Share of a window's blocks that a needed channel must cover.  No evidence recorded."""
-SLIP_SPAN = 0.3
-"""Time [s] over which the present slip and pull are averaged.  No evidence recorded."""
 EDGE_LEAD = 0.005
 """Bins begin this long before the first sample [s]: else each frame of its message would fall on
 an edge, and a microsecond would decide on which side."""
@@ -95,7 +93,7 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Means over the last SLIP_SPAN: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
+    """Means over the last MOMENT_SPAN: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
 
     And draft [N] and pitch [rad] as measured. None where not known.
     """
@@ -383,11 +381,11 @@ class Intake:
         ]
 
     def latest(self, now: float) -> Latest:
-        """Slip, pull, motion, draft and pitch over the last SLIP_SPAN before `now` [s]."""
+        """Slip, pull, motion, draft and pitch over the last MOMENT_SPAN before `now` [s]."""
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        raw = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._implausible))
+        raw = without(self._bins.glimpse(last - MOMENT_SPAN, last), self.rig, set(self._implausible))
         window = completed(forward(raw), self.rig)
         if self.rig.chassis is None:
             return Latest(self._slip(window), None)

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
-from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Moment, Watch, moments, watched, with_loss
-from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motions, slope_felt
+from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched, with_loss
+from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, bins_of_a_moment, motions, slope_felt
 from soilbus.decision.traction_loss import observed as loss_after
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
@@ -247,13 +247,13 @@ def _looks_and_curves(
         if result.curve is not None:
             curves.append((due, result.curve))
     seen = completed(forward(store.window(0.0, end)), rig)
-    losses, loss, bins = [], NO_LOSS, np.arange(len(seen.t))
-    for motion in motions(seen, rig, limit, config.traversability, bins, BINS_OF_A_MOMENT):
+    losses, loss, bins, ends = [], NO_LOSS, bins_of_a_moment(settings.bin), np.arange(len(seen.t))
+    for motion in motions(seen, rig, limit, config.traversability, ends, bins):
         loss = loss_after(loss, motion, config)
         losses.append(loss)
     looks = [
         moment._replace(inertia=moment.inertia - slope_felt(loss, rig))
-        for moment, loss in zip(moments(seen, rig, bins, settings.min_speed), losses, strict=True)
+        for moment, loss in zip(moments(seen, rig, ends, bins, settings.min_speed), losses, strict=True)
     ]
     return looks, losses, curves
 
