@@ -55,6 +55,9 @@ __all__ = [
     "Wheel",
 ]
 
+SHORT_BIN = 0.04
+"""Length of a bin [s] in which a wheel's slip hardly changes while its load shakes at 1.5 to 3 Hz; evidence at
+`Estimator.bin`."""
 CONTROL_FREE_NAME = r"^[A-Za-z0-9_-]{1,16}$"
 Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
 SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
@@ -994,7 +997,7 @@ class Config(_Section):
         if (shared or any(len(wheels) > 1 for wheels in self.same_signal("torque"))) and (
             "bin" not in self.estimator.model_fields_set
         ):
-            object.__setattr__(self, "estimator", self.estimator.model_copy(update={"bin": 0.04}))
+            object.__setattr__(self, "estimator", self.estimator.model_copy(update={"bin": SHORT_BIN}))
         return self
 
     def axle_named(self, name: str | None) -> Axle | None:

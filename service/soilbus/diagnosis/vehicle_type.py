@@ -380,7 +380,10 @@ def _own_log_evidence(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Ar
 
 
 def _columns(places: Sequence[Mapping[str, float]], names: int = 0) -> tuple[Array, list[str]]:
-    """Log odds (R, 1 + K) of nothing and of each name, relative to nothing, and the names; at least so many columns."""
+    """Log odds (R, 1 + K) of nothing and of each name, relative to nothing, and the names.
+
+    names: least K; columns without a name are -inf.
+    """
     columns = sorted({name for place in places for name in place})
     log_odds = np.full((len(places), 1 + max(names, len(columns))), -np.inf)
     log_odds[:, 0] = 0.0

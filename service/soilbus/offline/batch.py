@@ -24,6 +24,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
@@ -620,9 +621,7 @@ def _diagnose_all(
         findings_of_type(
             vehicles[0][0].setup,
             len(vehicles),
-            lambda given, vehicles=vehicles: _diagnosed(  # type: ignore[misc]
-                client, vehicles, given, out / "parts", progress, retry
-            ),
+            partial(_diagnosed, client, vehicles, parts=out / "parts", progress=progress, retry=retry),
         )
         for vehicles in types.values()
     ]

@@ -169,12 +169,12 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     Notes
     -----
     For channels of the vehicle only, whose mass lets them change slowly.  What a wheel does swings with its load at
-    1.5 to 3 Hz, so a wheel's bin holds what was measured in it or nothing.  A gap of more than one and a half times the
-    channel's usual one, where a sample is lost, stays empty.
+    1.5 to 3 Hz, so a wheel's bin holds what was measured in it or nothing.  One lost sample doubles the gap, so a gap
+    of more than one and a half times the channel's usual one stays empty.
     """
     filled = count > 0.0
     n_filled = filled.sum(0)
-    slow = np.flatnonzero((n_filled < 0.75 * len(filled)) & (n_filled > 2))
+    slow = np.flatnonzero((n_filled > 2) & (n_filled < len(filled)))
     if not len(slow):
         return mean, since, count
     mean, since, per_bin = mean.copy(), since.copy(), count.copy()
