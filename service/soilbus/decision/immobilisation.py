@@ -512,15 +512,16 @@ def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float
 def _due_to_the_curve(line: Line, reserve: Line, relative: float) -> bool:
     """Whether a capacity falls only as its curve may be too high or too low by a factor.
 
-    C' = P' - a P_hat',  ln a ~ N(0, relative^2): where slip and pull rise or fall together, the sign of C' is that of
-    their ratio less a; where the pull does not rise with slip, it is negative for every a.
+    C' = P' - a P_hat',  ln a ~ N(0, relative^2): where slip and pull rise together, the sign of C' is that of their
+    ratio less a; where the pull does not rise with growing slip, it is negative for every a.  Where slip falls, the
+    wheels are relieved: the capacity is then lost only if the curve is steep enough at this very slip, where
+    `relative`, of its largest pull, says too little.
     """
     predicted = -reserve.slope
     given = line.slope + predicted
-    if predicted * given <= 0.0:
-        return predicted < 0.0
-    ratio = predicted / given if predicted > 0.0 else given / predicted
-    return math.log(ratio) < SIGNIFICANT_SD * relative
+    if predicted < 0.0:
+        return True
+    return predicted > 0.0 and given > 0.0 and math.log(predicted / given) < SIGNIFICANT_SD * relative
 
 
 def _time_of_creep(line: Line, limit: float, rise: float) -> float:
