@@ -14,7 +14,7 @@ import pytest
 
 from soilbus.config.model import Config
 from soilbus.decision.capability import Capability, Forecast, OverSlip
-from soilbus.decision.immobilisation import Alert, Warnings, Watch, ended, has_cause, watched
+from soilbus.decision.immobilisation import Alert, Warnings, Watch, common_slip, ended, has_cause, watched
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss, motion_of, observed
 from soilbus.decision.traversability import State, Traversability
@@ -277,3 +277,20 @@ def test_a_warning_that_only_lasts_ends_with_a_go_and_does_not_begin_again():
         over = watched(over, 0.1 * i, [0.04], 1000.0, CURVE)
         log = log.after(0.1 * i, over.warning)
     assert log.begun == ()
+
+
+@pytest.mark.parametrize("torque", [0.25, 0.35])
+def test_the_common_slip_of_wheels_on_a_differential_hardly_grows_as_their_loads_shift(torque: float):
+    def slip(load: float) -> float:
+        """Slip at which 0.6 (1 - K / (l s) (1 - e^(-l s / K))) = torque / load, l / K = 8 (Janosi and Hanamoto)."""
+        s = np.linspace(1e-3, 0.9, 9000)
+        return float(np.interp(torque / load, 0.6 * (1.0 - (1.0 - np.exp(-8.0 * s)) / (8.0 * s)), s))
+
+    even, shifted = slip(1.0), (slip(0.85), slip(1.15))
+    assert abs(common_slip(shifted) - even) < 0.5 * abs(sum(shifted) / 2.0 - even)
+
+
+def test_the_common_slip_of_wheels_that_slip_alike_is_their_slip():
+    assert common_slip([0.12] * 4) == pytest.approx(0.12)
+    assert common_slip([-0.05]) == pytest.approx(-0.05)
+    assert math.isfinite(common_slip([-400.0, 0.1]))  # a wheel that hardly turns

@@ -6,8 +6,14 @@
                          (C - Q) / (Q' - C')                                     draft and slope Q outgrow it
                          (s_max - s) / s'                                        slip creeps at a steady pull
 
-The recursion: `watched` takes one moment (a `Look`: time, mean slip, pull given, pull asked) and the `Watch` before it,
-updates the regressions' sums and the peaks, and returns the next `Watch` with its warning.  Slip alone gives no
+Wheels on a differential share a torque: as load shifts between them, the lighter one gains more slip than the other
+loses, and their mean slip grows at the same pull.  The common slip s, at which both would give what they give, hardly
+grows:
+
+    e^(-b s) = mean of e^(-b s_w)                        mu = mu_max (1 - e^(-b s)), b = 7.5 (Brixius 1987)
+
+The recursion: `watched` takes one moment (a `Look`: time, common slip, pull given, pull asked) and the `Watch` before
+it, updates the regressions' sums and the peaks, and returns the next `Watch` with its warning.  Slip alone gives no
 warning: it grows slowly at first and then runs away.  The capacity does not swing with the draft and falls steadily
 where the soil softens, so the warning comes when it is about to fall below what is asked, at a peak or growing.
 Inertia counts as pull given, but no vehicle gains speed for long, so only draft and slope count as asked.  Their rise
@@ -55,6 +61,8 @@ CREEP_MEMORY = 4.0
 """Time constant [s] of forgetting slip that creeps, and the pull that it gives."""
 PEAK_MEMORY = 300.0
 """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
+SLIP_EXPONENT = 7.5
+"""Growth of the gross traction ratio with slip: mu = mu_max (1 - e^(-7.5 s)) (Brixius 1987, tyres in fields)."""
 LONGEST_GAP = 1.0
 """Silence [s] after which the trends start afresh."""
 LOOKS_KEPT = 10.0
@@ -233,7 +241,7 @@ class Peaks(NamedTuple):
 
 
 class Look(NamedTuple):
-    """One moment: time [s], mean slip, pull given [N] (draft, slope, inertia), pull asked by draft and slope [N]."""
+    """One moment: time [s], common slip, pull given [N] (draft, slope, inertia), pull asked by draft and slope [N]."""
 
     t: float
     slip: float
@@ -251,7 +259,7 @@ class Watch(NamedTuple):
     recent, curve
         The last moments, and the pull over slip along which their capacity was computed.
     capacity, demand, slip, given
-        Trends of the capacity [N], of draft and slope [N], of the mean slip and of the pull given [N].
+        Trends of the capacity [N], of draft and slope [N], of the common slip and of the pull given [N].
     peaks, asked
         Greatest pull given and greatest demand [N] of the last PEAK_MEMORY.
     caused
@@ -324,7 +332,7 @@ def watched(
     step = t - before.t
     if not 0.0 <= step <= LONGEST_GAP:
         before, step = _restarted(before, t)._replace(since=t), 0.0
-    look = Look(t, sum(slips) / len(slips), pull, pull - inertia)
+    look = Look(t, common_slip(slips), pull, pull - inertia)
     reserve = _reserve(curve, look.slip)
     kept = before.recent[bool(before.recent and t - before.recent[0].t > LOOKS_KEPT) :]
     trend = before.capacity if curve is before.curve else _capacity_along(curve, kept)
@@ -356,6 +364,23 @@ def watched(
     return Watch(
         t, before.since, (*kept, look), curve, capacity, demand, creep, given, peaks, asked, caused, warning, time_left
     )  # fmt: skip
+
+
+def common_slip(slips: Sequence[float]) -> float:
+    """The slip at which all wheels would give the mean of what they give at their own slips.
+
+    Parameters
+    ----------
+    slips
+        Of one wheel or more, of like size.
+
+    Notes
+    -----
+    e^(-b s) = mean of e^(-b s_w), from the traction ratio mu = mu_max (1 - e^(-b s)) (Brixius 1987).
+    """
+    least = min(slips)
+    mean = sum(math.exp(SLIP_EXPONENT * (least - slip)) for slip in slips) / len(slips)
+    return least - math.log(mean) / SLIP_EXPONENT
 
 
 def with_loss(watch: Watch, loss: TractionLoss, now: float = -math.inf) -> Watch:
