@@ -12,7 +12,6 @@ from soilbus.estimation.tracker import (
     Reason,
     Shown,
     SoilState,
-    TrackerOptions,
     TrackerState,
     next_state,
 )
@@ -24,7 +23,7 @@ QUIET = Shown(None, None, None, mismatch=False, settled=True)
 
 
 def after(state: SoilState, shown: Shown, end: float) -> tuple[TrackerState, Reason]:
-    following = next_state(state, shown, end, LENGTH, TrackerOptions())
+    following = next_state(state, shown, end, LENGTH)
     return following.name, following.reason
 
 
@@ -42,18 +41,17 @@ def test_without_another_soil_it_stays_the_same(shown, reason):
 
 def test_a_change_with_too_few_data_is_suspect_and_remembered():
     shown = QUIET._replace(found=Reason.CHANGE_STATISTIC, change=CHANGE)
-    following = next_state(SoilState(), shown, 21.0, LENGTH, TrackerOptions())
+    following = next_state(SoilState(), shown, 21.0, LENGTH)
     assert (following.name, following.reason) == (TrackerState.SUSPECT, Reason.CHANGE_STATISTIC)
     assert following.change == CHANGE
     assert following.transition is None
 
 
-def test_a_sharp_border_is_over_at_once_and_a_gradual_one_when_the_soil_has_lasted():
-    found = QUIET._replace(found=Reason.TWO_SOILS, transition=SHARP)
-    assert after(SoilState(), found, 21.0) == (TrackerState.NEW_SOIL, Reason.TWO_SOILS)
-    gradual = found._replace(transition=GRADUAL)
-    assert after(SoilState(), gradual, 25.0) == (TrackerState.TRANSITION, Reason.TOO_SHORT)
-    assert after(SoilState(), gradual, 29.5) == (TrackerState.NEW_SOIL, Reason.TWO_SOILS)
+@pytest.mark.parametrize("transition", [SHARP, GRADUAL])
+def test_a_border_is_over_as_soon_as_its_soil_fits(transition):
+    found = QUIET._replace(found=Reason.TWO_SOILS, transition=transition)
+    assert after(SoilState(), found._replace(settled=False), 25.0) == (TrackerState.TRANSITION, Reason.UNSETTLED)
+    assert after(SoilState(), found, 25.0) == (TrackerState.NEW_SOIL, Reason.TWO_SOILS)
 
 
 def test_a_border_is_not_over_while_its_soil_does_not_fit_however_late():

@@ -106,9 +106,6 @@ class TrackerOptions:
         Windows that the data must fill for the posterior to be a later prior: with less it is not Gaussian.
     max_unexplained
         Windows after a change point during which a change may explain a mismatch.
-    settling_ratio
-        Time that a new soil must last, over that of its gradual border, until the transition is over; at most
-        `min_to_learn`.  No evidence recorded.
     extension_shares
         Shares of a new soil's data that are tried as part of its transition.
     transition_lengths
@@ -130,7 +127,6 @@ class TrackerOptions:
     min_to_detect: float = 0.3
     min_to_learn: float = 0.5
     max_unexplained: float = 2.0
-    settling_ratio: float = 2.0
     extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
     transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
     default_wheelbase: float = 2.0
@@ -172,7 +168,6 @@ class Reason(StrEnum):
     """The last border is less than a window ago (new soil)."""
     UNSETTLED = "unsettled"
     """The fit of the new soil exceeds its chi-square limit just after a border (transition)."""
-    TOO_SHORT = "new_soil_too_short"
     """The new soil has lasted too short a time for its gradual border to be over (transition)."""
 
 
@@ -273,7 +268,7 @@ class Shown(NamedTuple):
     settled: bool
 
 
-def next_state(state: SoilState, shown: Shown, end: float, window: float, options: TrackerOptions) -> SoilState:
+def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
     """State after a window that ended at `end` [s], of length `window` [s].
 
     Parameters
@@ -284,7 +279,6 @@ def next_state(state: SoilState, shown: Shown, end: float, window: float, option
         What the window shows.
     end, window : float
         [s].
-    options : TrackerOptions
 
     Returns
     -------
@@ -299,10 +293,6 @@ def next_state(state: SoilState, shown: Shown, end: float, window: float, option
     now = replace(now, transition=transition)
     if not shown.settled:
         return replace(now, name=S.TRANSITION, reason=Reason.UNSETTLED)
-    length = transition.end - transition.begin
-    is_sharp = length < transition.lag + window / 100.0  # shorter than the vehicle
-    if not is_sharp and end - transition.end < min(options.settling_ratio * length, options.min_to_learn * window):
-        return replace(now, name=S.TRANSITION, reason=Reason.TOO_SHORT)
     return replace(now, name=S.NEW_SOIL, reason=shown.found or Reason.SPANS_BORDER)
 
 
@@ -460,7 +450,7 @@ class Tracker:
         fit = explanation.fit
         settled = fit is not None and self._is_settled(fit)
         shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit), settled)
-        state = next_state(self._state, shown, end, self.settings.window, self.options)
+        state = next_state(self._state, shown, end, self.settings.window)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
             reason=state.reason, change=state.change,
