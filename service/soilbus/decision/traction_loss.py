@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 LONGEST_GAP = 1.0
 """Silence [s] after which durations are counted from zero."""
 MOMENT_SPAN = 0.3
-"""Time [s] over which a moment's slip and pull are averaged: half a period of loads that shake at 1.5 to 3 Hz."""
+"""Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake at 1.5 to 3 Hz."""
 
 
 class Motion(NamedTuple):
