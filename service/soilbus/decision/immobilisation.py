@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.decision.stall_forecast import LONGEST_GAP
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
 from soilbus.terra.vehicle import slip_ratio
@@ -63,8 +64,6 @@ PEAK_MEMORY = 300.0
 """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 SLIP_EXPONENT = 7.5
 """Growth of the gross traction ratio with slip: mu = mu_max (1 - e^(-7.5 s)) (Brixius 1987, tyres in fields)."""
-LONGEST_GAP = 1.0
-"""Silence [s] after which the trends start afresh."""
 LOOKS_KEPT = 10.0
 """Age [s] up to which moments are kept for the next curve."""
 SETTLING_TIME = 2.0

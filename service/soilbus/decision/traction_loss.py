@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
-from soilbus.decision.stall_forecast import Sample, StallForecast, forecast
+from soilbus.decision.stall_forecast import LONGEST_GAP, Sample, StallForecast, forecast
 from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window, pairs, pull_given
@@ -34,10 +34,9 @@ from soilbus.terra.vehicle import GRAVITY
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
 
-LONGEST_GAP = 1.0
-"""Silence [s] after which durations are counted from zero."""
 MOMENT_SPAN = 0.3
-"""Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake at 1.5 to 3 Hz."""
+"""Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake at 1.5 to 3 Hz.
+With 0.12 s one bogging less was warned of in time on two of three machines (122 boggings, seed 71)."""
 
 
 class Motion(NamedTuple):
