@@ -107,6 +107,8 @@ class FittedModel:
         Change of -2 log evidence by the prior of unknown scale (see `evidence`).
     reported
         Estimates by effect and parameter that replace the Gaussian ones, where the posterior is not Gaussian.
+    expected_chi2
+        Chi-square of all blocks by the sensors' noise alone: the number of residuals, less where loads are computed.
     """
 
     effects: tuple[Effect, ...]
@@ -118,6 +120,7 @@ class FittedModel:
     checks: tuple[HeldOutCheck, ...]
     mixture_correction: float = 0.0
     reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
+    expected_chi2: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -143,8 +146,8 @@ class FittedModel:
 
     @property
     def excess(self) -> float:
-        """By how much the squared residuals of all blocks, in units of their variance, exceed their number."""
-        return self.neg2_log_posterior + self.gap * self.checked_rows - self.rows
+        """By how much the squared residuals of all blocks, in units of their variance, exceed what noise leaves."""
+        return self.neg2_log_posterior + self.gap * self.checked_rows - self.expected_chi2
 
     @property
     def gap(self) -> float:
@@ -314,7 +317,23 @@ def fit_model(
     added = [effect for effect in effects if effect not in present.effects]
     correction = sum(_mixture_correction(effect, free, fits, checks) for effect in added)
     return FittedModel(
-        tuple(effects), free, free_unheld, first_prior, tuple(joint_priors), tuple(fits), tuple(checks), correction
+        tuple(effects), free, free_unheld, first_prior, tuple(joint_priors), tuple(fits), tuple(checks), correction,
+        expected_chi2=_expected_chi2(records, effects, free, fits, checks),
+    )  # fmt: skip
+
+
+def _expected_chi2(
+    records: Sequence[Record],
+    effects: Sequence[Effect],
+    free: Sequence[Free],
+    fits: Sequence[Fit],
+    checks: Sequence[HeldOutCheck],
+) -> float:
+    """FittedModel.expected_chi2."""
+    return sum(
+        record.training.with_effects(effects, free).expected_chi2(fit.optimum.at, fit.optimum.gains)
+        + held_out.problem.expected_chi2(held_out.at, fit.mode.gains)
+        for record, fit, held_out in zip(records, fits, checks, strict=True)
     )
 
 

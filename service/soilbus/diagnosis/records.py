@@ -121,7 +121,7 @@ def record_of(
     TooLittle
         Where the recording has not enough usable instants.
     """
-    problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn)
+    problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn).on_curves()
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)

@@ -153,6 +153,15 @@ class Instrumentation:
             for on, row in zip(wheels, self.load, strict=True)
         ])  # fmt: skip
 
+    @property
+    def torques_of_sides(self) -> NDArray[np.bool_]:
+        """Which rows of torques (W,) are differences of two wheels whose loads' difference nothing measures."""
+        sides = [np.array(row.weight) != 0.0 for row in self.load if row.kind == "side"]
+        return np.array([
+            row.kind == "coupling" and any(np.array_equal(np.array(row.weight) != 0.0, of_side) for of_side in sides)
+            for row in self.torque
+        ])  # fmt: skip
+
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import ROLLING_SLIP, completed
-from soilbus.estimation.local_cubics import Series
+from soilbus.estimation.local_cubics import Series, curve_of
 from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -166,7 +166,35 @@ class Measurements:
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
         self.held_covariance: Array | None = None
+        self._off_curve: Array | None = None
         self._count()
+
+    def on_curves(self) -> Self:
+        """The same with latents on smooth curves of what is measured, and without rows that hold a load's share only.
+
+        Latents fitted to an instant are free of the residuals' noise where S is the residuals' covariance.  Computed
+        loads leave more open than they vary by: S is several times too large, the latents keep their noise, and
+        derivatives taken there go with the residuals.  On the channels' curves they do not (regression calibration:
+        Carroll et al. 2006, Measurement Error in Nonlinear Models, ch. 4).  Equal torques behind a differential, where
+        nothing measures the loads left and right, say how these differ; the slips differ with them, so that any effect
+        of slip would seem to explain what the loads do.  The same where all loads are measured.
+        """
+        if not self.computes_loads:
+            return self
+        calm = copy(self)
+        calm.has_torque = self.has_torque & ~self._of_sides
+        calm._known = self._known.copy()
+        calm._known[:, : len(self._of_sides)] = calm.has_torque
+        calm._row_var = np.where(calm._known, self._row_var, 1.0)
+        calm._count()
+        noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
+        of_draft, of_inertia = (
+            off_curve(self.t, *column)[:, None]
+            for column in ((self.draft, self.draft_var), (self.inertia, self.inertia_var))
+        )
+        of_computed = self.by_draft * of_draft + self.by_inertia * of_inertia
+        calm._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
+        return calm
 
     def _observe(self) -> None:
         """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""
@@ -177,12 +205,14 @@ class Measurements:
         self._mass_gain: int | None = None
         self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
         self._by_torques = np.zeros_like(self._prior_only)
+        self._of_sides = np.zeros(len(self.rig.wheels), bool)
         if given is not None:
             self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
             self._by_torques[: len(given.load)] = given.loads_by_torques
             self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
             self._prior_only &= ~self._by_torques
+            self._of_sides = given.torques_of_sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
     def observed(self, latents: Array) -> Array:
@@ -285,6 +315,7 @@ class Measurements:
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
         part.held_covariance = None if self.held_covariance is None else self.held_covariance[instants]
+        part._off_curve = None if self._off_curve is None else self._off_curve[instants]
         part._count()
         return part
 
@@ -316,6 +347,14 @@ class Curves:
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])
+
+
+def off_curve(t: Array, value: Array, variance: Array) -> Array:
+    """By how much values (N,) at times t (N,) [s] differ from their smooth curve; 0 where their variance is."""
+    off, noisy = np.zeros(len(t)), variance > 0.0
+    if noisy.any():
+        off[noisy] = value[noisy] - curve_of(t[noisy], value[noisy], variance[noisy]).value
+    return off
 
 
 def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:

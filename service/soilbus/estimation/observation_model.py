@@ -479,6 +479,19 @@ class ObservationModel(Measurements):
             held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
         return held
 
+    def expected_chi2(self, at: Linearisation, gains: Array) -> float:
+        """Chi-square that the sensors' noise leaves, loads being as computed; the number of rows without such loads.
+
+        E[r' S^-1 r] = tr(S^-1 (S - K)) at each instant, where K is what computed loads leave open (`with_weights_at`).
+        """
+        if not self.computes_loads:
+            return float(self.n_rows)
+        by_loads = (
+            self._by_load_noise(at.by_latents, at.variance) if self.held_covariance is None else self.held_covariance
+        )
+        inverse = self.inverse_covariance(at.by_latents, *self.variances(gains))
+        return float(self.n_rows - np.sum(inverse * by_loads))
+
     def noise_of_fitted(self, optimum: Optimum) -> Array:
         """Variance (N, 2 W + 1) of the noise in latents: V as measured; V - V A' S^-1 A V where torques say more."""
         A, noise, fitted = optimum.at.by_latents, optimum.at.variance, self._by_torques
@@ -618,7 +631,7 @@ class ObservationModel(Measurements):
         return residual
 
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
-        """Latents at their conditional optimum after a step of soil and gains, by the linear model.
+        """Latents at their conditional optimum, or on their curves, after a step of soil and gains: the linear model.
 
         Parameters
         ----------
@@ -633,8 +646,10 @@ class ObservationModel(Measurements):
         weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
             self.n, 1, at.by_latents.shape[1]
         )
-        own_noise = np.where(self._prior_only, 0.0, at.variance)
-        new = at.corrected - own_noise * (weighed @ at.by_latents)[:, 0] - at.by_gain * gain_step[layout.latent_gains]
+        noise = self._off_curve
+        if noise is None:
+            noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
+        new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
         load, speed, ground, _ = self._latents(self.from_observed(new), latents.entry_angle)
@@ -762,11 +777,15 @@ class ObservationModel(Measurements):
         )  # fmt: skip
 
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
-        """Latents at their measured values; entry angles solved at soil and gains (G,) from a guess (N, W) [rad]."""
+        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).
+
+        guess: entry angles (N, W) [rad] to begin with.
+        """
         angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
-        return self.with_entry_angles(
-            Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil, gains
-        )
+        latents = Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
+        if self._off_curve is not None:
+            latents = self._latents(self.from_observed(self._measured - self._off_curve), angle)
+        return self.with_entry_angles(latents, soil, gains)
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """The same latents with the entry angles at which this soil carries their loads at gains (G,)."""
