@@ -49,6 +49,8 @@ _BY_INSTANT = (
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
+_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
+"""The same of those that may be None."""
 
 
 def gain_names(rig: Rig) -> list[str]:
@@ -166,6 +168,7 @@ class Measurements:
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
         self.held_covariance: Array | None = None
+        self.common_weights: Array | None = None
         self._off_curve: Array | None = None
         self._count()
 
@@ -314,8 +317,9 @@ class Measurements:
         part = copy(self)
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
-        part.held_covariance = None if self.held_covariance is None else self.held_covariance[instants]
-        part._off_curve = None if self._off_curve is None else self._off_curve[instants]
+        for name in _BY_INSTANT_IF_ANY:
+            values = getattr(self, name)
+            setattr(part, name, None if values is None else values[instants])
         part._count()
         return part
 
