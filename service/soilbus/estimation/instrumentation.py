@@ -154,13 +154,16 @@ class Instrumentation:
         ])  # fmt: skip
 
     @property
-    def torques_of_sides(self) -> NDArray[np.bool_]:
-        """Which rows of torques (W,) are differences of two wheels whose loads' difference nothing measures."""
-        sides = [np.array(row.weight) != 0.0 for row in self.load if row.kind == "side"]
-        return np.array([
-            row.kind == "coupling" and any(np.array_equal(np.array(row.weight) != 0.0, of_side) for of_side in sides)
-            for row in self.torque
-        ])  # fmt: skip
+    def sides(self) -> tuple[tuple[int, int], ...]:
+        """Row of torques and row of loads of each two wheels with equal torques whose loads' difference is computed."""
+        wheels = {q: [np.array(row.weight) != 0.0 for row in getattr(self, q)] for q in ("torque", "load")}
+        return tuple(
+            (i, k)
+            for i, torque in enumerate(self.torque)
+            for k, load in enumerate(self.load)
+            if torque.kind == "coupling" and load.kind == "side"
+            if np.array_equal(wheels["torque"][i], wheels["load"][k])
+        )
 
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""

@@ -49,7 +49,7 @@ _BY_INSTANT = (
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
-_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
+_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve", "_side_known")
 """The same of those that may be None."""
 
 
@@ -170,6 +170,7 @@ class Measurements:
         self.held_covariance: Array | None = None
         self.common_weights: Array | None = None
         self._off_curve: Array | None = None
+        self._side_known: NDArray[np.bool_] | None = None
         self._count()
 
     def on_curves(self) -> Self:
@@ -185,9 +186,13 @@ class Measurements:
         if not self.computes_loads:
             return self
         calm = copy(self)
-        calm.has_torque = self.has_torque & ~self._of_sides
-        calm._known = self._known.copy()
-        calm._known[:, : len(self._of_sides)] = calm.has_torque
+        calm.has_torque, calm._known, calm._measured_var = (
+            a.copy() for a in (self.has_torque, self._known, self._measured_var)
+        )
+        calm._side_known = np.stack([self.has_torque[:, i] for i, _ in self._sides], axis=1) if self._sides else None
+        for torque, load in self._sides:
+            calm.has_torque[:, torque] = calm._known[:, torque] = False
+            calm._measured_var[self.has_torque[:, torque], load] = 0.0
         calm._row_var = np.where(calm._known, self._row_var, 1.0)
         calm._count()
         noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
@@ -208,14 +213,14 @@ class Measurements:
         self._mass_gain: int | None = None
         self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
         self._by_torques = np.zeros_like(self._prior_only)
-        self._of_sides = np.zeros(len(self.rig.wheels), bool)
+        self._sides: tuple[tuple[int, int], ...] = ()
         if given is not None:
             self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
             self._by_torques[: len(given.load)] = given.loads_by_torques
             self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
             self._prior_only &= ~self._by_torques
-            self._of_sides = given.torques_of_sides
+            self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
     def observed(self, latents: Array) -> Array:

@@ -165,6 +165,7 @@ class Linearisation:
     load_by_soil: Array  # (6, N, W)
     load_by_effects: Array  # (P, N, W)
     rolling_slip: Array  # (N, F) slips of the free wheels after a Newton step
+    side_load: Array  # (N, S) loads left less right behind differentials after a Newton step
 
     @property
     def chi2(self) -> float:
@@ -357,6 +358,8 @@ class ObservationModel(Measurements):
             by_effects[:, torques] += (of_torque * delay.by_torque - delay.by_predicted).transpose(1, 2, 0)
             by_effects[:, balance] += delay.by_demand.T
             by_effects += np.einsum("nml,pnl->nmp", A, by_delay)
+        sides = self._side_loads(A, at.value[1], now)
+        corrected[:, [load for _, load in self._sides] if sides.size else []] = now[:, [load for _, load in self._sides] if sides.size else []]
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
         if delay is not None:
             corrected = corrected + delay.measured * of_latents
@@ -389,6 +392,7 @@ class ObservationModel(Measurements):
             load_by_soil=at.load_by_soil,
             load_by_effects=at.load_by_effects,
             rolling_slip=rolling_slip,
+            side_load=sides,
         )
 
     def denoised(self, optimum: Optimum) -> tuple[Self, Latents]:
@@ -509,6 +513,21 @@ class ObservationModel(Measurements):
         noise = noise.copy()
         noise[:, fitted] = prior - prior**2 * (by * (inverse @ by)).sum(1)
         return noise
+
+    def _side_loads(self, A: Array, torque: Array, now: Array) -> Array:
+        """Loads left less right (N, S) after a Newton step to equal torques, of wheels whose torques are (N, W) [N m].
+
+        A: derivatives of the residuals by the observations; now: the observations of the latents.
+        """
+        if self._side_known is None:
+            return np.zeros((self.n, 0))
+        found = now[:, [load for _, load in self._sides]]
+        for s, (row, column) in enumerate(self._sides):
+            axle, slope = self._measured[:, column], -A[:, row, column]
+            step = np.divide(-self.torque_rows(torque)[:, row], slope, out=np.zeros(self.n), where=slope > 0.0)
+            step = np.clip(step, -STEP_OF_SIDES * axle, STEP_OF_SIDES * axle) * self._side_known[:, s]
+            found[:, s] = np.clip(found[:, s] + step, (1.0 - MAX_SIDE) * axle, (1.0 + MAX_SIDE) * axle)
+        return found
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
         """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
@@ -659,6 +678,8 @@ class ObservationModel(Measurements):
         new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
+        if at.side_load.size:
+            new[:, [load for _, load in self._sides]] = at.side_load
         load, speed, ground, _ = self._latents(self.from_observed(new), latents.entry_angle)
         if self.rolls.any():
             speed = speed.copy()
@@ -1231,6 +1252,8 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     return shrunk
 
 
+STEP_OF_SIDES, MAX_SIDE = 0.2, 0.8
+"""x"""
 SINGULAR_RIDGE = 1e-10
 """Added to the squares of rows in their sd where these are linearly dependent within rounding (eps m = 1e-15)."""
 
