@@ -171,17 +171,22 @@ class Measurements:
         self.common_weights: Array | None = None
         self._off_curve: Array | None = None
         self._side_known: NDArray[np.bool_] | None = None
+        self._side_columns: list[int] = []
         self._count()
 
     def on_curves(self) -> Self:
-        """The same with latents on smooth curves of what is measured, and without rows that hold a load's share only.
+        """The same with latents on smooth curves of what is measured, and side loads by equal torques.
 
         Latents fitted to an instant are free of the residuals' noise where S is the residuals' covariance.  Computed
         loads leave more open than they vary by: S is several times too large, the latents keep their noise, and
         derivatives taken there go with the residuals.  On the channels' curves they do not (regression calibration:
-        Carroll et al. 2006, Measurement Error in Nonlinear Models, ch. 4).  Equal torques behind a differential, where
-        nothing measures the loads left and right, say how these differ; the slips differ with them, so that any effect
-        of slip would seem to explain what the loads do.  The same where all loads are measured.
+        Carroll et al. 2006, Measurement Error in Nonlinear Models, ch. 4).
+
+        Wheels with equal torques behind an open differential slip by their loads.  Where nothing measures the loads
+        left and right, T_left(W_left) = T_right(W_right) fixes their difference, as T = 0 fixes the slip of a free
+        wheel: that row is used up.  Held equal, an effect of slip would seem to explain what the loads do.
+
+        The same where all loads are measured.
         """
         if not self.computes_loads:
             return self
@@ -189,7 +194,9 @@ class Measurements:
         calm.has_torque, calm._known, calm._measured_var = (
             a.copy() for a in (self.has_torque, self._known, self._measured_var)
         )
-        calm._side_known = np.stack([self.has_torque[:, i] for i, _ in self._sides], axis=1) if self._sides else None
+        if self._sides:
+            calm._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
+            calm._side_columns = [load for _, load in self._sides]
         for torque, load in self._sides:
             calm.has_torque[:, torque] = calm._known[:, torque] = False
             calm._measured_var[self.has_torque[:, torque], load] = 0.0

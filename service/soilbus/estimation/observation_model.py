@@ -68,6 +68,9 @@ FIRST_GAIN = SOIL.stop
 """Column of the first nuisance parameter: the sensor gains, then the effect parameters."""
 TIME_TOLERANCE = 1e-3
 """Times [s] closer than this are those of one bin."""
+MAX_SIDE_STEP, MAX_SIDE = 0.2, 0.8
+"""Difference of the loads left and right of an axle over their sum: in one Newton step, as torque is curved in it, and
+at all, as none of the wheels leaves the ground."""
 _TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
 """Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
 _DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
@@ -358,8 +361,8 @@ class ObservationModel(Measurements):
             by_effects[:, torques] += (of_torque * delay.by_torque - delay.by_predicted).transpose(1, 2, 0)
             by_effects[:, balance] += delay.by_demand.T
             by_effects += np.einsum("nml,pnl->nmp", A, by_delay)
-        sides = self._side_loads(A, at.value[1], now)
-        corrected[:, [load for _, load in self._sides] if sides.size else []] = now[:, [load for _, load in self._sides] if sides.size else []]
+        side_load = self._side_load(A, at.value[1], now)
+        corrected[:, self._side_columns] = now[:, self._side_columns]
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
         if delay is not None:
             corrected = corrected + delay.measured * of_latents
@@ -392,7 +395,7 @@ class ObservationModel(Measurements):
             load_by_soil=at.load_by_soil,
             load_by_effects=at.load_by_effects,
             rolling_slip=rolling_slip,
-            side_load=sides,
+            side_load=side_load,
         )
 
     def denoised(self, optimum: Optimum) -> tuple[Self, Latents]:
@@ -488,7 +491,7 @@ class ObservationModel(Measurements):
     def expected_chi2(self, at: Linearisation, gains: Array) -> float:
         """Chi-square less what the model misses: the number of rows, or by the sensors' noise where loads are computed.
 
-        With C = S - K, where K is what computed loads leave open, and weights R common to all models (`with_weights_at`),
+        With C = S - K, K what computed loads leave open, and weights R that all models share (`with_weights_at`),
 
             E[r' R r] = tr(R C) + b' R b        b: error of the model
 
@@ -514,18 +517,20 @@ class ObservationModel(Measurements):
         noise[:, fitted] = prior - prior**2 * (by * (inverse @ by)).sum(1)
         return noise
 
-    def _side_loads(self, A: Array, torque: Array, now: Array) -> Array:
-        """Loads left less right (N, S) after a Newton step to equal torques, of wheels whose torques are (N, W) [N m].
+    def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
+        """Observations (N, S) of loads left less right after a Newton step to equal torques; see `on_curves`.
 
-        A: derivatives of the residuals by the observations; now: the observations of the latents.
+        A: derivatives of the residuals by the observations; torque: of the wheels (N, W) [N m]; now: observations of
+        the latents, in which equal loads are the axle's load.
         """
+        found = now[:, self._side_columns]
         if self._side_known is None:
-            return np.zeros((self.n, 0))
-        found = now[:, [load for _, load in self._sides]]
+            return found
+        off = self.torque_rows(torque)
         for s, (row, column) in enumerate(self._sides):
             axle, slope = self._measured[:, column], -A[:, row, column]
-            step = np.divide(-self.torque_rows(torque)[:, row], slope, out=np.zeros(self.n), where=slope > 0.0)
-            step = np.clip(step, -STEP_OF_SIDES * axle, STEP_OF_SIDES * axle) * self._side_known[:, s]
+            step = np.divide(-off[:, row], slope, out=np.zeros(self.n), where=slope > 0.0)
+            step = np.clip(step, -MAX_SIDE_STEP * axle, MAX_SIDE_STEP * axle) * self._side_known[:, s]
             found[:, s] = np.clip(found[:, s] + step, (1.0 - MAX_SIDE) * axle, (1.0 + MAX_SIDE) * axle)
         return found
 
@@ -678,8 +683,7 @@ class ObservationModel(Measurements):
         new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
-        if at.side_load.size:
-            new[:, [load for _, load in self._sides]] = at.side_load
+        new[:, self._side_columns] = at.side_load
         load, speed, ground, _ = self._latents(self.from_observed(new), latents.entry_angle)
         if self.rolls.any():
             speed = speed.copy()
@@ -1252,8 +1256,6 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     return shrunk
 
 
-STEP_OF_SIDES, MAX_SIDE = 0.2, 0.8
-"""x"""
 SINGULAR_RIDGE = 1e-10
 """Added to the squares of rows in their sd where these are linearly dependent within rounding (eps m = 1e-15)."""
 
