@@ -18,7 +18,8 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
 (`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
 two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
-pull are curved in the load, so that unequal loads held equal bias the soil.  Behind a differential no torque says so.
+pull are curved in the load, so that unequal loads held equal bias the soil.  Behind a differential no torque says so;
+a diagnosis, which compares models over minutes, takes it from equal torques and unequal slips (`on_curves`).
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
