@@ -133,9 +133,10 @@ class Capacity(NamedTuple):
         values = value, value, part, part, float(value is not None), change
         return Capacity(*later(self, step, values, options.capacity_memories))
 
-    def is_known(self, options: WatchOptions = WATCH) -> bool:
-        """Whether the capacity is known at enough of the last moments."""
-        return self.known.y > options.least_known_share * self.known.n
+    @property
+    def is_known(self) -> bool:
+        """Whether the capacity was known at more than half of the last moments."""
+        return self.known.y > 0.5 * self.known.n
 
     def slope_std(self, line: Line, options: WatchOptions = WATCH) -> float:
         """Upper bound of the standard deviation of a line's slope [N/s]; inf where no change is known.
@@ -169,7 +170,7 @@ class Demand(NamedTuple):
     ) -> Demand:
         """A step [s] later, with one more value [N]; earlier, earliest: those `swing_time` and twice that before."""
         change = None if earlier is None or earliest is None else (value - 2.0 * earlier + earliest) ** 2
-        return Demand(*later(self, step, (value, change), (options.demand_memory, options.swing_memory)))
+        return Demand(*later(self, step, (value, change), (options.demand_memory, options.scatter_memory)))
 
     def swing_std(self, options: WatchOptions = WATCH) -> float:
         """Standard deviation [N] of the swing; inf where it is not known.
@@ -321,7 +322,7 @@ def watched(
     peaks = before.peaks.joined(t, pull, options.peak_memory)
     asked = before.asked.joined(t, look.asked, options.peak_memory)
     creep, given = later(
-        (before.slip, before.given), step, (look.slip, pull), (options.creep_memory, options.creep_memory)
+        (before.slip, before.given), step, (look.slip, pull), (options.demand_memory, options.demand_memory)
     )
     *of_capacity, rising, creeping, giving = lines((*capacity[:4], demand.trend, creep, given))
     total = pull + reserve
@@ -331,13 +332,13 @@ def watched(
         time_left = 0.0
         if reserve > 0.0:
             time_left = _time_of_creep(creeping, float(curve.slip[-1]), giving.slope / total, options)
-            if capacity.is_known(options):
+            if capacity.is_known:
                 outgrown = _time_to_outgrow(of_capacity[0], rising, look.asked, demand, asked.greatest, options)
                 weak = _time_to_weaken(capacity, of_capacity, peaks.greatest, _relative_std(curve), options)
                 time_left = min(weak, outgrown, time_left)
     warns = before.warning is Alert.IMMOBILISATION
     rises = share > options.rising_share and rise > options.steady_rise and time_left is not None
-    enough = share > options.staying_share if warns else rises
+    enough = share > options.any_rise_share if warns else rises
     caused = t if enough or (time_left is not None and time_left < options.warning_time) else before.caused
     warning = Alert.UNKNOWN if time_left is None else Alert.NONE
     if t - caused < options.hold:
@@ -505,8 +506,8 @@ def _time_to_weaken(
 ) -> float:
     """Time [s] until the capacity, extrapolated, falls to the peak of the pull [N]; relative: sd of the curve."""
     slow, fast, reserve, short_reserve = of_capacity
-    long = _time_of_weakening(capacity, slow, options.long_weakening, peak, options)
-    short = _time_of_weakening(capacity, fast, options.short_weakening, peak, options)
+    long = _time_of_weakening(capacity, slow, peak, options)
+    short = _time_of_weakening(capacity, fast, peak, options)
     if _due_to_the_curve(slow, reserve, options.significant_sd * relative):
         long = math.inf
     if _due_to_the_curve(fast, short_reserve, options.significant_sd * relative):
@@ -516,10 +517,9 @@ def _time_to_weaken(
     return max(min(long, short), 0.0)
 
 
-def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float, options: WatchOptions) -> float:
+def _time_of_weakening(capacity: Capacity, line: Line, peak: float, options: WatchOptions) -> float:
     """Time [s] until a line of the capacity falls to the peak [N]; inf where it does not fall significantly."""
-    significant = options.significant_sd * capacity.slope_std(line, options)
-    falls = -line.slope > max(least * abs(line.value), significant)
+    falls = -line.slope > options.significant_sd * capacity.slope_std(line, options)
     return (line.value - peak) / -line.slope if falls else math.inf
 
 

@@ -32,19 +32,13 @@ class WatchOptions:
     short_memory: float = 0.8
     """Time constant [s] of forgetting a capacity: of a soft patch's edge."""
     scatter_memory: float = 10.0
-    """Time constant [s] of forgetting how much a capacity scatters."""
+    """Time constant [s] of forgetting how much a capacity scatters and a demand swings."""
     scatter_lag: float = 0.5
     """Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground."""
-    least_known_share: float = 0.4
-    """Share [1] of the last moments whose capacity must be known for its trend to be used."""
     demand_memory: float = 4.0
-    """Time constant [s] of forgetting a demand, of which a line is to show a rise and not a swing."""
-    swing_memory: float = 20.0
-    """Time constant [s] of forgetting how a demand swings."""
+    """Time constant [s] of forgetting slip, pull, and a demand, of which a line is to show a rise and not a swing."""
     swing_time: float = 1.5
     """Time [s] after which a demand that swings is another: draft swings within some seconds."""
-    creep_memory: float = 4.0
-    """Time constant [s] of forgetting slip that creeps, and the pull that it gives."""
     peak_memory: float = 300.0
     """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 
@@ -54,16 +48,11 @@ class WatchOptions:
     """Time [s] after its last cause at which the warning ends."""
     sure_rise_share: float = 0.71
     """Share [1] from which a significant rise of draft and slope beyond their last peaks is extrapolated."""
-    staying_share: float = 0.76
-    """Share [1] that draft and slope ask for from which a warning does not end."""
     any_rise_share: float = 0.79
-    """Share [1] that draft and slope ask for from which a rise is extrapolated, significant or not."""
+    """Share [1] that draft and slope ask for from which a rise is extrapolated, significant or not, and from which a
+    warning does not end."""
     rising_share: float = 0.85
     """Share [1] that draft and slope ask for from which any rise or swing of theirs may become too much."""
-    long_weakening: float = 0.006
-    """Loss, as a share of the capacity [1/s], from which the ground counts as weakening by the long memory."""
-    short_weakening: float = 0.03
-    """The same [1/s] by the short memory."""
     steepening: float = 1.6
     """Ratio [1] of the short memory's loss to the long one's from which the loss is expected to grow by this factor
     again: front wheels meet an edge first, rear ones a wheelbase later."""
