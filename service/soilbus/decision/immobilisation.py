@@ -465,7 +465,7 @@ def _capacity_along(curve: OverSlip, recent: Sequence[Look], options: WatchOptio
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:
-    """Pull [N] that the curve still gains beyond this slip."""
+    """Pull [N] that the curve still gains beyond this slip; 0 at slips where most soils allow no steady driving."""
     slips, pulls, ahead = _known_pulls(curve)
     i = bisect_right(slips, slip)
     if i == len(slips):
