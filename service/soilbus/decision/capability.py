@@ -70,7 +70,8 @@ class Demand:
 class OverSlip:
     """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m].
 
-    Equation 22 and figure 13 of Xi et al. 2024, with load transfer and standard deviations.
+    Equation 22 and figure 13 of Xi et al. 2024, with load transfer and standard deviations; nan where by the most
+    likely soil, or by most soils of the posterior, no wheel loads and sinkages are in balance.
     """
 
     slip: Array

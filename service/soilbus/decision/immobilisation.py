@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.decision.options import WATCH, WatchOptions
 from soilbus.decision.stall_forecast import LONGEST_GAP
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
@@ -41,51 +42,6 @@ from soilbus.terra.vehicle import slip_ratio
 
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
-
-LONG_MEMORY, SHORT_MEMORY = 2.5, 0.8
-"""Time constants [s] of forgetting a capacity: of ground that softens over many metres, and of a soft patch's edge."""
-SCATTER_MEMORY = 10.0
-"""Time constant [s] of forgetting how much a capacity scatters."""
-CAPACITY_MEMORIES = LONG_MEMORY, SHORT_MEMORY, LONG_MEMORY, SHORT_MEMORY, SHORT_MEMORY, SCATTER_MEMORY
-"""Time constants [s] of the trends of a `Capacity`, in their order."""
-DEMAND_MEMORY = 4.0
-"""Time constant [s] of forgetting a demand, of which a line is to show a rise and not a swing."""
-SWING_MEMORY = 20.0
-"""Time constant [s] of forgetting how a demand swings."""
-SWING_TIME = 1.5
-"""Time [s] after which a demand that swings is another: draft swings within some seconds."""
-SCATTER_LAG = 0.5
-"""Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground."""
-LEAST_KNOWN_SHARE = 0.4
-"""Share of the last moments whose capacity must be known for its trend to be used."""
-CREEP_MEMORY = 4.0
-"""Time constant [s] of forgetting slip that creeps, and the pull that it gives."""
-PEAK_MEMORY = 300.0
-"""A peak of the demand is remembered this long [s] at least, and at most twice as long."""
-SLIP_EXPONENT = 7.5
-"""Growth of the gross traction ratio with slip: mu = mu_max (1 - e^(-7.5 s)) (Brixius 1987, tyres in fields)."""
-LOOKS_KEPT = 10.0
-"""Age [s] up to which moments are kept for the next curve."""
-SETTLING_TIME = 2.0
-"""Age [s] of a trend from which it is used."""
-WARNING_TIME = 10.0
-"""Time left [s] below which the warning is given."""
-SURE_RISE_SHARE, STAYING_SHARE, ANY_RISE_SHARE, RISING_SHARE = 0.71, 0.76, 0.79, 0.85
-"""Shares of the capacity that draft and slope ask for.  In order: from which a significant rise beyond their last peaks
-is extrapolated; from which a warning does not end; from which a rise is extrapolated, significant or not; from which
-any rise or swing of theirs may become too much."""
-LONG_WEAKENING, SHORT_WEAKENING = 0.006, 0.03
-"""Loss [1/s], as a share of the capacity, from which the ground counts as weakening: by long and by short memory."""
-STEEPENING = 1.6
-"""Ratio of the short memory's loss to the long one's from which the loss is expected to grow by this factor again:
-front wheels meet an edge first, rear ones a wheelbase later."""
-SIGNIFICANT_SD = 2.5
-"""Standard deviations by which a loss of capacity, and a rise of the demand, must differ from zero."""
-STEADY_RISE = 0.003
-"""Rise [1/s], as a share of the capacity: of the pull given, up to which growing slip is due to the ground; of draft
-and slope, beyond which they may become too much (while also given, for a vehicle that slows down gives less)."""
-WARNING_HOLD = 5.0
-"""Time [s] after its last cause at which the warning ends."""
 
 
 class Alert(StrEnum):
@@ -141,7 +97,7 @@ class Capacity(NamedTuple):
     """Trends of the capacity [N] with the long and the short memory, and what they are worth.
 
     reserve, short_reserve: trends of the part of it [N] that is not given but predicted by the curve, with both
-    memories; known: 1 for a moment whose capacity is known, else 0; scatter: square of its change within SCATTER_LAG
+    memories; known: 1 for a moment whose capacity is known, else 0; scatter: square of its change within `scatter_lag`
     [N^2].
     """
 
@@ -153,37 +109,44 @@ class Capacity(NamedTuple):
     scatter: Trend = Trend()
 
     @classmethod
-    def through(cls, t: Array, values: Array, reserves: Array) -> Capacity:
+    def through(cls, t: Array, values: Array, reserves: Array, options: WatchOptions = WATCH) -> Capacity:
         """The trends through values and reserves [N] at times t [s], each (N,); nan where not known."""
         if not len(t):
             return cls()
         x = t - t[-1]
-        change = (values - values[np.searchsorted(t, t - SCATTER_LAG)]) ** 2
+        change = (values - values[np.searchsorted(t, t - options.scatter_lag)]) ** 2
         change[0] = np.nan
         series = [values, values, reserves, reserves, np.isfinite(values), change]
-        return cls(*_trends(x, series, CAPACITY_MEMORIES))
+        return cls(*_trends(x, series, options.capacity_memories))
 
-    def joined(self, step: float, value: float | None, earlier: float | None, reserve: float = 0.0) -> Capacity:
-        """A step [s] later, with one more value [N] or None, the value SCATTER_LAG before, and its reserve [N]."""
+    def joined(
+        self,
+        step: float,
+        value: float | None,
+        earlier: float | None,
+        reserve: float = 0.0,
+        options: WatchOptions = WATCH,
+    ) -> Capacity:
+        """A step [s] later, with one more value [N] or None, the value `scatter_lag` before, and its reserve [N]."""
         change = None if value is None or earlier is None else (value - earlier) ** 2
         part = None if value is None else reserve
         values = value, value, part, part, float(value is not None), change
-        return Capacity(*later(self, step, values, CAPACITY_MEMORIES))
+        return Capacity(*later(self, step, values, options.capacity_memories))
 
     @property
     def is_known(self) -> bool:
-        """Whether the capacity is known at enough of the last moments."""
-        return self.known.y > LEAST_KNOWN_SHARE * self.known.n
+        """Whether the capacity was known at more than half of the last moments."""
+        return self.known.y > 0.5 * self.known.n
 
-    def slope_std(self, line: Line) -> float:
+    def slope_std(self, line: Line, options: WatchOptions = WATCH) -> float:
         """Upper bound of the standard deviation of a line's slope [N/s]; inf where no change is known.
 
         Notes
         -----
-        Changes within SCATTER_LAG have twice the variance of the scatter and hold little of a slow change of the
+        Changes within `scatter_lag` have twice the variance of the scatter and hold little of a slow change of the
         ground.  It is a bound because old moments, which are down-weighted, count as if they were not.
         """
-        in_lag = SCATTER_LAG / SHORT_MEMORY * self.known.n
+        in_lag = options.scatter_lag / options.short_memory * self.known.n
         variance = _estimated(self.scatter, in_lag) / 2.0
         return math.sqrt(in_lag * variance / line.spread) if line.spread > 0.0 else math.inf
 
@@ -191,33 +154,40 @@ class Capacity(NamedTuple):
 class Demand(NamedTuple):
     """Trend of a demand [N] and how much it swings about it.
 
-    swing: square [N^2] of the second difference over SWING_TIME, which is zero on any straight line.
+    swing: square [N^2] of the second difference over `swing_time`, which is zero on any straight line.
     """
 
     trend: Trend = Trend()
     swing: Trend = Trend()
 
-    def joined(self, step: float, value: float, earlier: float | None, earliest: float | None) -> Demand:
-        """A step [s] later, with one more value [N]; earlier, earliest: the values SWING_TIME and twice that before."""
+    def joined(
+        self,
+        step: float,
+        value: float,
+        earlier: float | None,
+        earliest: float | None,
+        options: WatchOptions = WATCH,
+    ) -> Demand:
+        """A step [s] later, with one more value [N]; earlier, earliest: those `swing_time` and twice that before."""
         change = None if earlier is None or earliest is None else (value - 2.0 * earlier + earliest) ** 2
-        return Demand(*later(self, step, (value, change), (DEMAND_MEMORY, SWING_MEMORY)))
+        return Demand(*later(self, step, (value, change), (options.demand_memory, options.scatter_memory)))
 
-    @property
-    def swing_std(self) -> float:
+    def swing_std(self, options: WatchOptions = WATCH) -> float:
         """Standard deviation [N] of the swing; inf where it is not known.
 
         The second difference of uncorrelated values has six times their variance.
         """
-        return math.sqrt(_estimated(self.swing, self._in_swing) / 6.0)
+        return math.sqrt(_estimated(self.swing, self._in_swing(options)) / 6.0)
 
-    def slope_std(self, line: Line) -> float:
-        """Upper bound of the standard deviation of the line's slope [N/s]: values within SWING_TIME count as one."""
-        return self.swing_std * math.sqrt(self._in_swing / line.spread) if line.spread > 0.0 else math.inf
+    def slope_std(self, line: Line, options: WatchOptions = WATCH) -> float:
+        """Upper bound of the standard deviation of the line's slope [N/s]: values within `swing_time` count as one."""
+        if line.spread <= 0.0:
+            return math.inf
+        return self.swing_std(options) * math.sqrt(self._in_swing(options) / line.spread)
 
-    @property
-    def _in_swing(self) -> float:
-        """Number of values within SWING_TIME."""
-        return SWING_TIME / DEMAND_MEMORY * self.trend.n
+    def _in_swing(self, options: WatchOptions) -> float:
+        """Number of values within `swing_time`."""
+        return options.swing_time / options.demand_memory * self.trend.n
 
 
 class Peaks(NamedTuple):
@@ -260,7 +230,7 @@ class Watch(NamedTuple):
     capacity, demand, slip, given
         Trends of the capacity [N], of draft and slope [N], of the common slip and of the pull given [N].
     peaks, asked
-        Greatest pull given and greatest demand [N] of the last PEAK_MEMORY.
+        Greatest pull given and greatest demand [N] of the last `peak_memory`.
     caused
         [s], when there was last a cause to warn.
     warning, time_left
@@ -298,6 +268,7 @@ def watched(
     pull: float | None,
     curve: OverSlip | None,
     inertia: float = 0.0,
+    options: WatchOptions = WATCH,
 ) -> Watch:
     """The watch after one more moment; moments may come at any rate.
 
@@ -315,11 +286,13 @@ def watched(
         Pull over slip of the last window's estimate.
     inertia
         [N], part of the pull that accelerates the vehicle.
+    options
+        Tuning values.
 
     Returns
     -------
     Watch
-        Its warning is unknown until the trends are SETTLING_TIME old.
+        Its warning is unknown until the trends are `settling_time` old.
 
     Notes
     -----
@@ -331,55 +304,67 @@ def watched(
     step = t - before.t
     if not 0.0 <= step <= LONGEST_GAP:
         before, step = _restarted(before, t)._replace(since=t), 0.0
-    look = Look(t, common_slip(slips), pull, pull - inertia)
+    look = Look(t, common_slip(slips, options.slip_exponent), pull, pull - inertia)
     reserve = _reserve(curve, look.slip)
-    kept = before.recent[bool(before.recent and t - before.recent[0].t > LOOKS_KEPT) :]
-    trend = before.capacity if curve is before.curve else _capacity_along(curve, kept)
-    earlier, once, twice = _looks_from(kept, (t - SCATTER_LAG, t - SWING_TIME, t - 2.0 * SWING_TIME))
-    capacity = trend.joined(
-        step, _capacity_at(curve, look, reserve), None if earlier is None else _capacity_at(curve, earlier), reserve
+    kept = before.recent[bool(before.recent and t - before.recent[0].t > options.looks_kept) :]
+    trend = before.capacity if curve is before.curve else _capacity_along(curve, kept, options)
+    earlier, once, twice = _looks_from(
+        kept, (t - options.scatter_lag, t - options.swing_time, t - 2.0 * options.swing_time), options.scatter_lag
     )
-    demand = before.demand.joined(step, look.asked, once and once.asked, twice and twice.asked)
-    peaks, asked = before.peaks.joined(t, pull, PEAK_MEMORY), before.asked.joined(t, look.asked, PEAK_MEMORY)
-    creep, given = later((before.slip, before.given), step, (look.slip, pull), (CREEP_MEMORY, CREEP_MEMORY))
+    capacity = trend.joined(
+        step,
+        _capacity_at(curve, look, reserve),
+        None if earlier is None else _capacity_at(curve, earlier),
+        reserve,
+        options,
+    )
+    demand = before.demand.joined(step, look.asked, once and once.asked, twice and twice.asked, options)
+    peaks = before.peaks.joined(t, pull, options.peak_memory)
+    asked = before.asked.joined(t, look.asked, options.peak_memory)
+    creep, given = later(
+        (before.slip, before.given), step, (look.slip, pull), (options.demand_memory, options.demand_memory)
+    )
     *of_capacity, rising, creeping, giving = lines((*capacity[:4], demand.trend, creep, given))
     total = pull + reserve
     share, rise = (min(look.asked, pull) / total, rising.slope / total) if total > 0.0 else (0.0, 0.0)
     time_left = None
-    if t - before.since >= SETTLING_TIME:
+    if t - before.since >= options.settling_time:
         time_left = 0.0
         if reserve > 0.0:
-            time_left = _time_of_creep(creeping, float(curve.slip[-1]), giving.slope / total)
+            time_left = _time_of_creep(creeping, float(curve.slip[-1]), giving.slope / total, options)
             if capacity.is_known:
-                outgrown = _time_to_outgrow(of_capacity[0], rising, look.asked, demand, asked.greatest)
-                weak = _time_to_weaken(capacity, of_capacity, peaks.greatest, _relative_std(curve))
+                outgrown = _time_to_outgrow(of_capacity[0], rising, look.asked, demand, asked.greatest, options)
+                weak = _time_to_weaken(capacity, of_capacity, peaks.greatest, _relative_std(curve), options)
                 time_left = min(weak, outgrown, time_left)
     warns = before.warning is Alert.IMMOBILISATION
-    enough = share > STAYING_SHARE if warns else share > RISING_SHARE and rise > STEADY_RISE and time_left is not None
-    caused = t if enough or (time_left is not None and time_left < WARNING_TIME) else before.caused
+    rises = share > options.rising_share and rise > options.steady_rise and time_left is not None
+    enough = share > options.any_rise_share if warns else rises
+    caused = t if enough or (time_left is not None and time_left < options.warning_time) else before.caused
     warning = Alert.UNKNOWN if time_left is None else Alert.NONE
-    if t - caused < WARNING_HOLD:
+    if t - caused < options.hold:
         warning = Alert.IMMOBILISATION
     return Watch(
         t, before.since, (*kept, look), curve, capacity, demand, creep, given, peaks, asked, caused, warning, time_left
     )  # fmt: skip
 
 
-def common_slip(slips: Sequence[float]) -> float:
+def common_slip(slips: Sequence[float], exponent: float = WATCH.slip_exponent) -> float:
     """The slip at which all wheels would give the mean of what they give at their own slips.
 
     Parameters
     ----------
     slips
         Of one wheel or more, of like size.
+    exponent
+        b, growth of the traction ratio with slip.
 
     Notes
     -----
     e^(-b s) = mean of e^(-b s_w), from the traction ratio mu = mu_max (1 - e^(-b s)) (Brixius 1987).
     """
     least = min(slips)
-    mean = sum(math.exp(SLIP_EXPONENT * (least - slip)) for slip in slips) / len(slips)
-    return least - math.log(mean) / SLIP_EXPONENT
+    mean = sum(math.exp(exponent * (least - slip)) for slip in slips) / len(slips)
+    return least - math.log(mean) / exponent
 
 
 def with_loss(watch: Watch, loss: TractionLoss, now: float = -math.inf) -> Watch:
@@ -449,12 +434,12 @@ def _restarted(before: Watch, t: float) -> Watch:
     return Watch(peaks=before.peaks, asked=before.asked) if t >= before.peaks.since else Watch()
 
 
-def _looks_from(recent: Sequence[Look], times: Iterable[float]) -> list[Look | None]:
-    """The first look from each time [s] on; None where it came SCATTER_LAG later or more."""
+def _looks_from(recent: Sequence[Look], times: Iterable[float], tolerance: float) -> list[Look | None]:
+    """The first look from each time [s] on; None where it came `tolerance` [s] later or more."""
     found: list[Look | None] = []
     for t in times:
         place = bisect_left(recent, (t,))  # a look begins with its time
-        found.append(recent[place] if place < len(recent) and recent[place].t - t < SCATTER_LAG else None)
+        found.append(recent[place] if place < len(recent) and recent[place].t - t < tolerance else None)
     return found
 
 
@@ -468,7 +453,7 @@ def _capacity_at(curve: OverSlip, look: Look, reserve: float | None = None) -> f
     return look.pull + (_reserve(curve, look.slip) if reserve is None else reserve)
 
 
-def _capacity_along(curve: OverSlip, recent: Sequence[Look]) -> Capacity:
+def _capacity_along(curve: OverSlip, recent: Sequence[Look], options: WatchOptions) -> Capacity:
     """The capacity at the last moments along a curve."""
     t, slip, pull, _ = np.array(recent, float).reshape(-1, len(Look._fields)).T
     known = np.isfinite(curve.pull)
@@ -476,11 +461,11 @@ def _capacity_along(curve: OverSlip, recent: Sequence[Look]) -> Capacity:
     ahead = np.append(np.maximum.accumulate(pulls[::-1])[::-1], pulls[-1:])[np.searchsorted(slips, slip, "right")]
     reserve = np.where(slip >= slips[-1], 0.0, ahead - np.interp(slip, slips, pulls))
     reserve = np.where(slip >= curve.slip[0], reserve, np.nan)
-    return Capacity.through(t, pull + reserve, reserve)
+    return Capacity.through(t, pull + reserve, reserve, options)
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:
-    """Pull [N] that the curve still gains beyond this slip."""
+    """Pull [N] that the curve still gains beyond this slip; 0 at slips where most soils allow no steady driving."""
     slips, pulls, ahead = _known_pulls(curve)
     i = bisect_right(slips, slip)
     if i == len(slips):
@@ -504,53 +489,59 @@ def _relative_std(curve: OverSlip) -> float:
     return float(curve.pull_std[most] / curve.pull[most]) if curve.pull[most] > 0.0 else math.inf
 
 
-def _time_to_outgrow(limit: Line, line: Line, asked: float, demand: Demand, peak: float) -> float:
+def _time_to_outgrow(
+    limit: Line, line: Line, asked: float, demand: Demand, peak: float, options: WatchOptions
+) -> float:
     """Time [s] until draft and slope, with their line, reach the capacity's limit; inf without a significant rise."""
     if asked < peak:
         return math.inf
-    rises = line.slope > SIGNIFICANT_SD * demand.slope_std(line) or asked > ANY_RISE_SHARE * limit.value
-    outgrows = asked > SURE_RISE_SHARE * limit.value and line.slope > max(limit.slope, 0.0) and rises
+    is_significant = line.slope > options.significant_sd * demand.slope_std(line, options)
+    rises = is_significant or asked > options.any_rise_share * limit.value
+    outgrows = asked > options.sure_rise_share * limit.value and line.slope > max(limit.slope, 0.0) and rises
     return max(limit.value - asked, 0.0) / (line.slope - limit.slope) if outgrows else math.inf
 
 
-def _time_to_weaken(capacity: Capacity, of_capacity: Sequence[Line], peak: float, relative: float) -> float:
+def _time_to_weaken(
+    capacity: Capacity, of_capacity: Sequence[Line], peak: float, relative: float, options: WatchOptions
+) -> float:
     """Time [s] until the capacity, extrapolated, falls to the peak of the pull [N]; relative: sd of the curve."""
     slow, fast, reserve, short_reserve = of_capacity
-    long = _time_of_weakening(capacity, slow, LONG_WEAKENING, peak)
-    short = _time_of_weakening(capacity, fast, SHORT_WEAKENING, peak)
-    if _due_to_the_curve(slow, reserve, relative):
+    long = _time_of_weakening(capacity, slow, peak, options)
+    short = _time_of_weakening(capacity, fast, peak, options)
+    if _due_to_the_curve(slow, reserve, options.significant_sd * relative):
         long = math.inf
-    if _due_to_the_curve(fast, short_reserve, relative):
+    if _due_to_the_curve(fast, short_reserve, options.significant_sd * relative):
         short = math.inf
-    if fast.slope < STEEPENING * min(slow.slope, 0.0):
-        short /= STEEPENING
+    if fast.slope < options.steepening * min(slow.slope, 0.0):
+        short /= options.steepening
     return max(min(long, short), 0.0)
 
 
-def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float) -> float:
+def _time_of_weakening(capacity: Capacity, line: Line, peak: float, options: WatchOptions) -> float:
     """Time [s] until a line of the capacity falls to the peak [N]; inf where it does not fall significantly."""
-    falls = -line.slope > max(least * abs(line.value), SIGNIFICANT_SD * capacity.slope_std(line))
+    falls = -line.slope > options.significant_sd * capacity.slope_std(line, options)
     return (line.value - peak) / -line.slope if falls else math.inf
 
 
-def _due_to_the_curve(line: Line, reserve: Line, relative: float) -> bool:
-    """Whether a capacity falls only as its curve may be too high or too low by a factor.
+def _due_to_the_curve(line: Line, reserve: Line, factor: float) -> bool:
+    """Whether a capacity falls only as its curve may be too high or too low by e^factor.
 
-    C' = P' - a P_hat',  ln a ~ N(0, relative^2): where slip and pull rise together, the sign of C' is that of their
+    C' = P' - a P_hat',  |ln a| < factor: where slip and pull rise together, the sign of C' is that of their
     ratio less a; where the pull does not rise with growing slip, it is negative for every a.  Where slip falls, the
     wheels are relieved: the capacity is then lost only if the curve is steep enough at this very slip, where
-    `relative`, of its largest pull, says too little.
+    the sd of its largest pull says too little.
     """
     predicted = -reserve.slope
     given = line.slope + predicted
     if predicted < 0.0:
         return True
-    return predicted > 0.0 and given > 0.0 and math.log(predicted / given) < SIGNIFICANT_SD * relative
+    return predicted > 0.0 and given > 0.0 and math.log(predicted / given) < factor
 
 
-def _time_of_creep(line: Line, limit: float, rise: float) -> float:
+def _time_of_creep(line: Line, limit: float, rise: float, options: WatchOptions) -> float:
     """Time [s] until slip, growing under a pull that hardly rises (rise [1/s]), passes the limit."""
-    return max(limit - line.value, 0.0) / line.slope if line.slope > 0.0 and abs(rise) < STEADY_RISE else math.inf
+    creeps = line.slope > 0.0 and abs(rise) < options.steady_rise
+    return max(limit - line.value, 0.0) / line.slope if creeps else math.inf
 
 
 def _trends(x: Array, series: Sequence[Array], memories: Sequence[float]) -> list[Trend]:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
+from soilbus.decision.options import WATCH, WatchOptions
 from soilbus.decision.stall_forecast import LONGEST_GAP, Sample, StallForecast, forecast
 from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 from soilbus.estimation.posterior import Estimate
@@ -33,10 +34,6 @@ from soilbus.terra.vehicle import GRAVITY
 
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
-
-MOMENT_SPAN = 0.3
-"""Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake at 1.5 to 3 Hz.
-With 0.12 s one bogging less was warned of in time on two of three machines (122 boggings, seed 71)."""
 
 
 class Motion(NamedTuple):
@@ -296,9 +293,9 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     return found[0] if found else None
 
 
-def bins_of_a_moment(bin_length: float) -> int:
+def bins_of_a_moment(bin_length: float, options: WatchOptions = WATCH) -> int:
     """Number of bins of a length [s] over which a moment's means go."""
-    return max(round(MOMENT_SPAN / bin_length), 1)
+    return max(round(options.moment_span / bin_length), 1)
 
 
 def motions(

@@ -142,7 +142,7 @@ class TrackerState(StrEnum):
     SUSPECT = "suspect"
     """The newest data disagree with this soil, but are too few to estimate another; the estimate is of this soil."""
     TRANSITION = "transition"
-    """Another soil; the border may not be over: its data do not agree yet or cover too little time."""
+    """Another soil; the border may not be over: its data do not agree yet."""
     NEW_SOIL = "new_soil"
     """Another soil for less than a window; only its own data count."""
 
@@ -168,7 +168,6 @@ class Reason(StrEnum):
     """The last border is less than a window ago (new soil)."""
     UNSETTLED = "unsettled"
     """The fit of the new soil exceeds its chi-square limit just after a border (transition)."""
-    """The new soil has lasted too short a time for its gradual border to be over (transition)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,8 @@ from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
-from soilbus.decision.traction_loss import MOMENT_SPAN, Motion, motion_of
+from soilbus.decision.options import WATCH
+from soilbus.decision.traction_loss import Motion, motion_of
 from soilbus.estimation.assembly import Motor, Motors, delays_of, motors_of, rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
@@ -93,7 +94,7 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Means over the last MOMENT_SPAN: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
+    """Means over the last `moment_span`: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
 
     And draft [N] and pitch [rad] as measured. None where not known.
     """
@@ -381,11 +382,11 @@ class Intake:
         ]
 
     def latest(self, now: float) -> Latest:
-        """Slip, pull, motion, draft and pitch over the last MOMENT_SPAN before `now` [s]."""
+        """Slip, pull, motion, draft and pitch over the last `moment_span` before `now` [s]."""
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        raw = without(self._bins.glimpse(last - MOMENT_SPAN, last), self.rig, set(self._implausible))
+        raw = without(self._bins.glimpse(last - WATCH.moment_span, last), self.rig, set(self._implausible))
         window = completed(forward(raw), self.rig)
         if self.rig.chassis is None:
             return Latest(self._slip(window), None)

@@ -24,6 +24,7 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched, with_loss
+from soilbus.decision.options import WATCH, WatchOptions
 from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, bins_of_a_moment, motions, slope_felt
 from soilbus.decision.traction_loss import observed as loss_after
 from soilbus.estimation.assembly import rig_of
@@ -197,9 +198,9 @@ def _first_perceptible(task: Task, trouble: BoggingDrive, end: float) -> float:
     return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
 
 
-def judged(kind: str, observation: Observation) -> WarningTrial:
+def judged(kind: str, observation: Observation, options: WatchOptions = WATCH) -> WarningTrial:
     """The trial's result from what the watch saw."""
-    t, warned = watch(observation)
+    t, warned = watch(observation, options)
     begins = t[1:][warned[1:] & ~warned[:-1]]
     seconds = observation.end - observation.start
     if not observation.passed or seconds <= MIN_DRIVE_TIME:
@@ -218,7 +219,7 @@ def _distance_since(observation: Observation, since: float) -> float:
     )
 
 
-def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
+def watch(observation: Observation, options: WatchOptions = WATCH) -> tuple[Array, NDArray[np.bool_]]:
     """Times [s] (N,) of the looks, and whether each warned."""
     state, curve, curves, out = Watch(), None, iter(observation.curves), []
     due = next(curves, None)
@@ -226,7 +227,7 @@ def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
     for moment, loss in zip(observation.moments, losses, strict=True):
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
-        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
+        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia, options)
         out.append((moment.t, with_loss(state, loss).warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5

@@ -5,11 +5,12 @@
     diagnosis    cases whose verdict or names change,  greatest change of a name's probability,
                  greatest |change of log pressure| / sd,  change of the model evaluations [%]
     types        types that get or lose an effect, types of which other vehicles agree, greatest change of a probability
+    watch        boggings more or less in time, greatest change of a lead [s], false warnings more or less
 
 Each field of the options is multiplied by 0.7 and by 1.3, counts rounded and changed by at least one, on fixed seeded
-drives, cases and types of vehicles (`estimates`, `diagnoses`, `types`).  A field of the solver is changed in the joint
-descent from a cold start, and in other descents where they have a value of their own.  `--page` writes the tables of
-service/docs/sensitivity.md.
+drives, cases, types of vehicles and boggings (`estimates`, `diagnoses`, `types`, `watches`).  A field of the solver is
+changed in the joint descent from a cold start, and in other descents where they have a value of their own.  `--page`
+writes the tables of service/docs/sensitivity.md.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
+from soilbus.decision import options as of_watch
+from soilbus.decision.options import WatchOptions
 from soilbus.diagnosis import options as of_diagnosis
 from soilbus.diagnosis.diagnose import NotFitted, diagnose
 from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
@@ -53,8 +56,11 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.validation.blind.cases import Case, cases
+from soilbus.validation.bogging_trials import Observation, Task, WarningTrial, judged, observed
+from soilbus.validation.boggings import KINDS
 from soilbus.validation.curved_drives import curved
 from soilbus.validation.driven_windows import task_of, windows
+from soilbus.validation.firm_drives import EASY, FIRM_KINDS
 
 FACTORS = (0.7, 1.3)
 HEAD = "| option | value | unit | -30 % | +30 % |"
@@ -115,7 +121,7 @@ def meanings(module: Any) -> Mapping[tuple[str, str], str]:
 
 def fields_of(options: Any, path: tuple[str, ...] = ()) -> Iterator[Field]:
     """All fields of options and of the options in them; of a descent only what is its own, but for `cold`."""
-    texts = {**meanings(of_estimator), **meanings(of_diagnosis)}
+    texts = {**meanings(of_estimator), **meanings(of_diagnosis), **meanings(of_watch)}
     for field in fields(options):
         value, here = getattr(options, field.name), (*path, field.name)
         is_shared = isinstance(options, SolverOptions) and path[-1] != "cold" and value == field.default
@@ -332,6 +338,34 @@ def change_of_types(before: Sequence[SharedEffect | None], after: Sequence[Share
     )
 
 
+@cache
+def boggings() -> tuple[tuple[str, Observation], ...]:
+    """A bogging of each kind and three drives on firm ground, on four motors and on one; kind and what the watch sees.
+
+    Moments are means over `moment_span`, which is therefore not varied.
+    """
+    tasks = [
+        Task(reference_configuration(path=path), kind, 501 + i)
+        for path in (TRACTOR, REAR_DRIVE)
+        for i, kind in enumerate((*KINDS, EASY, "headland", "stop_and_go"))
+    ]
+    return tuple((task.kind, observed(task)) for task in tasks)
+
+
+def watches(options: WatchOptions) -> list[WarningTrial]:
+    """The warnings of every drive."""
+    return [judged(kind, observation, options) for kind, observation in boggings()]
+
+
+def change_of_watches(before: Sequence[WarningTrial], after: Sequence[WarningTrial]) -> str:
+    """What moved, in a few words; empty where nothing did."""
+    in_time = sum(b.in_time for b in after) - sum(a.in_time for a in before)
+    lead = max((abs(b.lead - a.lead) for a, b in zip(before, after, strict=True) if math.isfinite(a.lead)), default=0.0)
+    firm = [(a, b) for a, b in zip(before, after, strict=True) if a.kind in FIRM_KINDS]
+    false = sum(b.warnings - a.warnings for a, b in firm)
+    return _words((in_time, "{:+d} in time"), (lead, "{:.1f} s"), (false, "{:+d} false"))
+
+
 def _words(*figures: tuple[float, str]) -> str:
     """The figures that do not round to zero, as they are printed."""
     texts = [text.format(value) for value, text in figures]
@@ -354,6 +388,7 @@ TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Callable[[Any, Any], str]], 
     ("estimator", EstimatorOptions(), estimates, change_of_estimates),
     ("diagnosis", DiagnosisOptions(), diagnoses, change_of_diagnoses),
     ("types", TypeOptions(), types, change_of_types),
+    ("watch", WatchOptions(), watches, change_of_watches),
 )
 """Name, options, what they are tried on, and how two results are compared."""
 
