@@ -222,7 +222,7 @@ def required_fall_beside(model: FittedModel, divisor: float, options: DiagnosisO
     Where loads are computed all of the excess counts, not only a gap beyond noise: loads shake, wheels slip by it, and
     a false effect follows a good part of that (a sixth of the excess in drives whose loads shake by 12 %).
     """
-    if model.checks[0].problem.computes_loads:
+    if model.checks[0].problem.computes_sides:
         return max(least_required_fall(divisor), options.least_gap_share * model.excess)
     return required_fall(divisor, model.gap, model.checked_rows, model.rows, options)
 

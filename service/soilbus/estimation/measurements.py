@@ -188,7 +188,7 @@ class Measurements:
 
         The same where all loads are measured.
         """
-        if not self.computes_loads:
+        if not self.computes_sides:
             return self
         calm = copy(self)
         calm.has_torque, calm._known, calm._measured_var = (
@@ -288,6 +288,11 @@ class Measurements:
     def demand(self) -> Array:
         """Pull [N] (N,) for draft, slope and inertia."""
         return self.draft + self.inertia
+
+    @property
+    def computes_sides(self) -> bool:
+        """Whether two wheels share a torque, and nothing measures how they share their axle's load."""
+        return bool(self._sides)
 
     @property
     def computes_loads(self) -> bool:

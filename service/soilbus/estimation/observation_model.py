@@ -498,7 +498,7 @@ class ObservationModel(Measurements):
 
         so that r' S^-1 r less what is returned is r' R r - tr(R C), free of what noise does in this model.
         """
-        if not self.computes_loads:
+        if not self.computes_sides:
             return float(self.n_rows)
         K = self._by_load_noise(at.by_latents, at.variance) if self.held_covariance is None else self.held_covariance
         inverse = self.inverse_covariance(at.by_latents, *self.variances(gains))
