@@ -186,7 +186,7 @@ class Measurements:
         left and right, T_left(W_left) = T_right(W_right) fixes their difference, as T = 0 fixes the slip of a free
         wheel: that row is used up.  Held equal, an effect of slip would seem to explain what the loads do.
 
-        The same where all loads are measured.
+        The same where no two wheels share a torque, or their loads are measured.
         """
         if not self.computes_sides:
             return self
@@ -194,9 +194,8 @@ class Measurements:
         calm.has_torque, calm._known, calm._measured_var = (
             a.copy() for a in (self.has_torque, self._known, self._measured_var)
         )
-        if self._sides:
-            calm._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
-            calm._side_columns = [load for _, load in self._sides]
+        calm._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
+        calm._side_columns = [load for _, load in self._sides]
         for torque, load in self._sides:
             calm.has_torque[:, torque] = calm._known[:, torque] = False
             calm._measured_var[self.has_torque[:, torque], load] = 0.0
