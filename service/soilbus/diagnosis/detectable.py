@@ -32,7 +32,8 @@ from soilbus.diagnosis.score import (
     normal_equations,
     shifted_effects,
 )
-from soilbus.diagnosis.verdict import required_fall, temperature
+from soilbus.diagnosis.search import required_fall_beside
+from soilbus.diagnosis.verdict import temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
@@ -71,7 +72,7 @@ def detectable(
     """The detectable size of every candidate beside the present model fitted to these recordings."""
     options = records[0].options
     divisor = temperature(present.excess, options)
-    required = required_fall(divisor, present.gap, present.checked_rows, present.rows, options)
+    required = required_fall_beside(present, divisor, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
     for effects in _with_further_starts(candidates):

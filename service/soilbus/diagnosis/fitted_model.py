@@ -107,6 +107,8 @@ class FittedModel:
         Change of -2 log evidence by the prior of unknown scale (see `evidence`).
     reported
         Estimates by effect and parameter that replace the Gaussian ones, where the posterior is not Gaussian.
+    expected_chi2
+        Chi-square of all blocks by the sensors' noise alone: the number of residuals, less where loads are computed.
     """
 
     effects: tuple[Effect, ...]
@@ -118,6 +120,7 @@ class FittedModel:
     checks: tuple[HeldOutCheck, ...]
     mixture_correction: float = 0.0
     reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
+    expected_chi2: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,10 +129,13 @@ class FittedModel:
 
     @property
     def neg2_log_evidence(self) -> float:
-        """-2 log of the marginal likelihood of all data, up to a constant."""
-        return (
-            sum(fit.neg2_log_evidence for fit in self.fits) + self.held_out_neg2_log_evidence + self.mixture_correction
-        )
+        """-2 log of the marginal likelihood of all data, up to a constant.
+
+        Of the chi-square only what exceeds the expected one counts: where loads are computed, the weights of speeds
+        follow the model, and one that makes their noise larger would seem to fit better.
+        """
+        likelihoods = sum(fit.neg2_log_evidence for fit in self.fits) + self.held_out_neg2_log_evidence
+        return likelihoods + self.mixture_correction + self.rows - self.expected_chi2
 
     @property
     def held_out_neg2_log_evidence(self) -> float:
@@ -143,8 +149,8 @@ class FittedModel:
 
     @property
     def excess(self) -> float:
-        """By how much the squared residuals of all blocks, in units of their variance, exceed their number."""
-        return self.neg2_log_posterior + self.gap * self.checked_rows - self.rows
+        """By how much the squared residuals of all blocks, in units of their variance, exceed what noise leaves."""
+        return self.neg2_log_posterior + self.gap * self.checked_rows - self.expected_chi2
 
     @property
     def gap(self) -> float:
@@ -314,7 +320,23 @@ def fit_model(
     added = [effect for effect in effects if effect not in present.effects]
     correction = sum(_mixture_correction(effect, free, fits, checks) for effect in added)
     return FittedModel(
-        tuple(effects), free, free_unheld, first_prior, tuple(joint_priors), tuple(fits), tuple(checks), correction
+        tuple(effects), free, free_unheld, first_prior, tuple(joint_priors), tuple(fits), tuple(checks), correction,
+        expected_chi2=_expected_chi2(records, effects, free, fits, checks),
+    )  # fmt: skip
+
+
+def _expected_chi2(
+    records: Sequence[Record],
+    effects: Sequence[Effect],
+    free: Sequence[Free],
+    fits: Sequence[Fit],
+    checks: Sequence[HeldOutCheck],
+) -> float:
+    """FittedModel.expected_chi2."""
+    return sum(
+        record.training.with_effects(effects, free).expected_chi2(fit.optimum.at, fit.optimum.gains)
+        + held_out.problem.expected_chi2(held_out.at, fit.mode.gains)
+        for record, fit, held_out in zip(records, fits, checks, strict=True)
     )
 
 

@@ -77,11 +77,12 @@ class Record:
         parts = [part.with_weights_at(at) for part, at in ((self.training, training), (self.held_out, held_out))]
         if self.whole is None or self.fold is None or parts[0].held_covariance is None:
             return replace(self, training=parts[0], held_out=parts[1])
-        whole, covariance = copy(self.whole), np.empty((self.whole.n, *parts[0].held_covariance.shape[1:]))
-        is_held_out = self.fold == self.options.folds - 1
-        for part, of_part in zip(parts, (~is_held_out, is_held_out), strict=True):
-            covariance[of_part] = part.held_covariance
-        whole.held_covariance = covariance
+        whole, is_held_out = copy(self.whole), self.fold == self.options.folds - 1
+        for name in ("held_covariance", "common_weights"):
+            of_parts = [getattr(part, name) for part in parts]
+            together = np.empty((self.whole.n, *of_parts[0].shape[1:]))
+            together[~is_held_out], together[is_held_out] = of_parts
+            setattr(whole, name, together)
         return replace(self, training=parts[0], held_out=parts[1], whole=whole)
 
     def thinned(self, every: int) -> Record:
@@ -121,7 +122,7 @@ def record_of(
     TooLittle
         Where the recording has not enough usable instants.
     """
-    problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn)
+    problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn).on_curves()
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)

@@ -77,9 +77,9 @@ def gap_limit(rows: int, options: DiagnosisOptions = DEFAULT) -> float:
 
 
 def temperature(excess: float, options: DiagnosisOptions = DEFAULT) -> float:
-    """T = 1 / zeta where the present model's squared residuals differ from their number by this much.
+    """T = 1 / zeta where the present model's squared residuals differ from what noise leaves by this much.
 
-    Fewer than expected, as behind computed loads, are as little a description of the noise as more.
+    Fewer than expected are as little a description of the noise as more.
     """
     return (1.0 + min(abs(excess), options.max_excess) / options.alpha) / options.zeta_0
 

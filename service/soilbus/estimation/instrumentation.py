@@ -153,6 +153,18 @@ class Instrumentation:
             for on, row in zip(wheels, self.load, strict=True)
         ])  # fmt: skip
 
+    @property
+    def sides(self) -> tuple[tuple[int, int], ...]:
+        """Row of torques and row of loads of each two wheels with equal torques whose loads' difference is computed."""
+        wheels = {q: [np.array(row.weight) != 0.0 for row in getattr(self, q)] for q in ("torque", "load")}
+        return tuple(
+            (i, k)
+            for i, torque in enumerate(self.torque)
+            for k, load in enumerate(self.load)
+            if torque.kind == "coupling" and load.kind == "side"
+            if np.array_equal(wheels["torque"][i], wheels["load"][k])
+        )
+
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import ROLLING_SLIP, completed
-from soilbus.estimation.local_cubics import Series
+from soilbus.estimation.local_cubics import Series, curve_of
 from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -49,6 +49,8 @@ _BY_INSTANT = (
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
+_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve", "_side_known")
+"""The same of those that may be None."""
 
 
 def gain_names(rig: Rig) -> list[str]:
@@ -166,7 +168,47 @@ class Measurements:
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
         self.held_covariance: Array | None = None
+        self.common_weights: Array | None = None
+        self._off_curve: Array | None = None
+        self._side_known: NDArray[np.bool_] | None = None
+        self._side_columns: list[int] = []
         self._count()
+
+    def on_curves(self) -> Self:
+        """The same with latents on smooth curves of what is measured, and side loads by equal torques.
+
+        Latents fitted to an instant are free of the residuals' noise where S is the residuals' covariance.  Computed
+        loads leave more open than they vary by: S is several times too large, the latents keep their noise, and
+        derivatives taken there go with the residuals.  On the channels' curves they do not (regression calibration:
+        Carroll et al. 2006, Measurement Error in Nonlinear Models, ch. 4).
+
+        Wheels with equal torques behind an open differential slip by their loads.  Where nothing measures the loads
+        left and right, T_left(W_left) = T_right(W_right) fixes their difference, as T = 0 fixes the slip of a free
+        wheel: that row is used up.  Held equal, an effect of slip would seem to explain what the loads do.
+
+        The same where no two wheels share a torque, or their loads are measured.
+        """
+        if not self.computes_sides:
+            return self
+        calm = copy(self)
+        calm.has_torque, calm._known, calm._measured_var = (
+            a.copy() for a in (self.has_torque, self._known, self._measured_var)
+        )
+        calm._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
+        calm._side_columns = [load for _, load in self._sides]
+        for torque, load in self._sides:
+            calm.has_torque[:, torque] = calm._known[:, torque] = False
+            calm._measured_var[self.has_torque[:, torque], load] = 0.0
+        calm._row_var = np.where(calm._known, self._row_var, 1.0)
+        calm._count()
+        noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
+        of_draft, of_inertia = (
+            off_curve(self.t, *column)[:, None]
+            for column in ((self.draft, self.draft_var), (self.inertia, self.inertia_var))
+        )
+        of_computed = self.by_draft * of_draft + self.by_inertia * of_inertia
+        calm._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
+        return calm
 
     def _observe(self) -> None:
         """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""
@@ -177,12 +219,14 @@ class Measurements:
         self._mass_gain: int | None = None
         self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
         self._by_torques = np.zeros_like(self._prior_only)
+        self._sides: tuple[tuple[int, int], ...] = ()
         if given is not None:
             self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
             self._by_torques[: len(given.load)] = given.loads_by_torques
             self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
             self._prior_only &= ~self._by_torques
+            self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
     def observed(self, latents: Array) -> Array:
@@ -245,6 +289,11 @@ class Measurements:
         return self.draft + self.inertia
 
     @property
+    def computes_sides(self) -> bool:
+        """Whether two wheels share a torque, and nothing measures how they share their axle's load."""
+        return bool(self._sides)
+
+    @property
     def computes_loads(self) -> bool:
         """Whether a load stays at its prior, which neither a load cell nor torques measure."""
         return bool(self._prior_only.any())
@@ -284,7 +333,9 @@ class Measurements:
         part = copy(self)
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
-        part.held_covariance = None if self.held_covariance is None else self.held_covariance[instants]
+        for name in _BY_INSTANT_IF_ANY:
+            values = getattr(self, name)
+            setattr(part, name, None if values is None else values[instants])
         part._count()
         return part
 
@@ -316,6 +367,14 @@ class Curves:
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])
+
+
+def off_curve(t: Array, value: Array, variance: Array) -> Array:
+    """By how much values (N,) at times t (N,) [s] differ from their smooth curve; 0 where their variance is."""
+    off, noisy = np.zeros(len(t)), variance > 0.0
+    if noisy.any():
+        off[noisy] = value[noisy] - curve_of(t[noisy], value[noisy], variance[noisy]).value
+    return off
 
 
 def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:

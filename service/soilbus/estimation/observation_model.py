@@ -18,7 +18,8 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
 (`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
 two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
-pull are curved in the load, so that unequal loads held equal bias the soil.  Behind a differential no torque says so.
+pull are curved in the load, so that unequal loads held equal bias the soil.  Behind a differential no torque says so;
+a diagnosis, which compares models over minutes, takes it from equal torques and unequal slips (`on_curves`).
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
@@ -68,6 +69,9 @@ FIRST_GAIN = SOIL.stop
 """Column of the first nuisance parameter: the sensor gains, then the effect parameters."""
 TIME_TOLERANCE = 1e-3
 """Times [s] closer than this are those of one bin."""
+MAX_SIDE_STEP, MAX_SIDE = 0.2, 0.8
+"""Difference of the loads left and right of an axle over their sum: in one Newton step, as torque is curved in it, and
+at all, as none of the wheels leaves the ground."""
 _TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
 """Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
 _DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
@@ -165,6 +169,7 @@ class Linearisation:
     load_by_soil: Array  # (6, N, W)
     load_by_effects: Array  # (P, N, W)
     rolling_slip: Array  # (N, F) slips of the free wheels after a Newton step
+    side_load: Array  # (N, S) loads left less right behind differentials after a Newton step
 
     @property
     def chi2(self) -> float:
@@ -357,6 +362,8 @@ class ObservationModel(Measurements):
             by_effects[:, torques] += (of_torque * delay.by_torque - delay.by_predicted).transpose(1, 2, 0)
             by_effects[:, balance] += delay.by_demand.T
             by_effects += np.einsum("nml,pnl->nmp", A, by_delay)
+        side_load = self._side_load(A, at.value[1], now)
+        corrected[:, self._side_columns] = now[:, self._side_columns]
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
         if delay is not None:
             corrected = corrected + delay.measured * of_latents
@@ -389,6 +396,7 @@ class ObservationModel(Measurements):
             load_by_soil=at.load_by_soil,
             load_by_effects=at.load_by_effects,
             rolling_slip=rolling_slip,
+            side_load=side_load,
         )
 
     def denoised(self, optimum: Optimum) -> tuple[Self, Latents]:
@@ -477,7 +485,27 @@ class ObservationModel(Measurements):
         held = copy(self)
         if self.computes_loads:
             held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
+            row_var = self.variances(np.zeros(len(self.gain_std)))[1]
+            held.common_weights = self.inverse_covariance(at.by_latents, at.variance, row_var)
         return held
+
+    def expected_chi2(self, at: Linearisation, gains: Array) -> float:
+        """Chi-square less what the model misses: the number of rows, or by the sensors' noise where loads are computed.
+
+        With C = S - K, K what computed loads leave open, and weights R that all models share (`with_weights_at`),
+
+            E[r' R r] = tr(R C) + b' R b        b: error of the model
+
+        so that r' S^-1 r less what is returned is r' R r - tr(R C), free of what noise does in this model.
+        """
+        if not self.computes_sides:
+            return float(self.n_rows)
+        K = self._by_load_noise(at.by_latents, at.variance) if self.held_covariance is None else self.held_covariance
+        inverse = self.inverse_covariance(at.by_latents, *self.variances(gains))
+        R = inverse if self.common_weights is None else self.common_weights
+        residual = at.rows[:, RESIDUAL].reshape(inverse.shape[:2])
+        missed = np.einsum("ni,nij,nj->", residual, R, residual) - np.sum(R * (np.linalg.inv(inverse) - K))
+        return float(at.chi2 - missed - np.count_nonzero(~self._known))
 
     def noise_of_fitted(self, optimum: Optimum) -> Array:
         """Variance (N, 2 W + 1) of the noise in latents: V as measured; V - V A' S^-1 A V where torques say more."""
@@ -489,6 +517,23 @@ class ObservationModel(Measurements):
         noise = noise.copy()
         noise[:, fitted] = prior - prior**2 * (by * (inverse @ by)).sum(1)
         return noise
+
+    def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
+        """Observations (N, S) of loads left less right after a Newton step to equal torques; see `on_curves`.
+
+        A: derivatives of the residuals by the observations; torque: of the wheels (N, W) [N m]; now: observations of
+        the latents, in which equal loads are the axle's load.
+        """
+        found = now[:, self._side_columns]
+        if self._side_known is None:
+            return found
+        off = self.torque_rows(torque)
+        for s, (row, column) in enumerate(self._sides):
+            axle, slope = self._measured[:, column], -A[:, row, column]
+            step = np.divide(-off[:, row], slope, out=np.zeros(self.n), where=slope > 0.0)
+            step = np.clip(step, -MAX_SIDE_STEP * axle, MAX_SIDE_STEP * axle) * self._side_known[:, s]
+            found[:, s] = np.clip(found[:, s] + step, (1.0 - MAX_SIDE) * axle, (1.0 + MAX_SIDE) * axle)
+        return found
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
         """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
@@ -618,7 +663,7 @@ class ObservationModel(Measurements):
         return residual
 
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
-        """Latents at their conditional optimum after a step of soil and gains, by the linear model.
+        """Latents at their conditional optimum, or on their curves, after a step of soil and gains: the linear model.
 
         Parameters
         ----------
@@ -633,10 +678,13 @@ class ObservationModel(Measurements):
         weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
             self.n, 1, at.by_latents.shape[1]
         )
-        own_noise = np.where(self._prior_only, 0.0, at.variance)
-        new = at.corrected - own_noise * (weighed @ at.by_latents)[:, 0] - at.by_gain * gain_step[layout.latent_gains]
+        noise = self._off_curve
+        if noise is None:
+            noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
+        new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
+        new[:, self._side_columns] = at.side_load
         load, speed, ground, _ = self._latents(self.from_observed(new), latents.entry_angle)
         if self.rolls.any():
             speed = speed.copy()
@@ -762,11 +810,15 @@ class ObservationModel(Measurements):
         )  # fmt: skip
 
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
-        """Latents at their measured values; entry angles solved at soil and gains (G,) from a guess (N, W) [rad]."""
+        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).
+
+        guess: entry angles (N, W) [rad] to begin with.
+        """
         angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
-        return self.with_entry_angles(
-            Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil, gains
-        )
+        latents = Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
+        if self._off_curve is not None:
+            latents = self._latents(self.from_observed(self._measured - self._off_curve), angle)
+        return self.with_entry_angles(latents, soil, gains)
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """The same latents with the entry angles at which this soil carries their loads at gains (G,)."""

@@ -51,9 +51,10 @@ def _reported(found: Iterable[tuple[Case, Trial | None]], out: TextIO | None) ->
         if trial is None:
             print(f"{case.id}: cannot be driven", flush=True)
             continue
+        of_model = "" if trial.bound is None else f", own model {trial.bound:.0f}"
         names = " + ".join(" or ".join(f"{n} {p:.2f}" for n, p in one.items()) for one in trial.sets)
         print(
-            f"{trial.half:7}{trial.id} [{trial.visible:.0f}]: {trial.verdict} {names}"
+            f"{trial.half:7}{trial.id} [{trial.visible:.0f}{of_model}]: {trial.verdict} {names}"
             f" gap {trial.gap_before:.3f} -> {trial.gap_after:.3f} {trial.seconds:.1f} s",
             flush=True,
         )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, norm
 
+from soilbus.validation.blind.bound import LEAST
 from soilbus.validation.blind.calibration import curve
 from soilbus.validation.blind.trial import Trial
 
@@ -66,6 +67,16 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
     yield _share(f"visible, by formulas {FAR}: named first", [first(t) == t.hidden[0] for t in far])
     yield _share(f"visible, by formulas {FAR}: in the set", [t.hidden[0] in in_set(t) for t in far])
     yield _share(f"visible, by formulas {FAR}: that or unknown", [_honest(t) for t in far])
+    bounded = [t for t in single if t.bound is not None]
+    if bounded:
+        can = [t for t in bounded if t.bound is not None and t.bound >= LEAST]
+        below = [t for t in bounded if t not in can]
+        yield _share(f"not shown by this recording (bound below {LEAST:.0f})", [t in below for t in bounded])
+        yield _share("  of these: named all the same, rightly", [first(t) == t.hidden[0] for t in below])
+        yield _share("  of these: named otherwise", [first(t) not in ("", t.hidden[0]) for t in below])
+        yield _share("shown by this recording: named first", [first(t) == t.hidden[0] for t in can])
+        yield _share("shown by this recording: in the set", [t.hidden[0] in in_set(t) for t in can])
+        yield _share("shown by this recording: named otherwise", [first(t) not in ("", t.hidden[0]) for t in can])
     for kind, most in (("plain", 0.03), ("hard", 0.10)):
         nulls = [t for t in trials if t.kind == kind]
         yield _share(f"nulls, {kind}: falsely named", [bool(t.named) for t in nulls], most=most)

@@ -15,6 +15,7 @@ from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.terra.effects.effect import Effect
+from soilbus.validation.blind.bound import bound
 from soilbus.validation.blind.cases import Case
 from soilbus.validation.blind.visible import Shown, shown
 
@@ -35,6 +36,7 @@ class Trial:
     with probabilities.  visible: what the recording shows of the effect, of two effects of
     the less visible one beside the other, and true_gap what it leaves unexplained, by the generator
     alone (visible.py; 0 and 1 where nothing is hidden).  A diagnosis that fails has the verdict FAILED and no names.
+    bound: where loads are computed, what the recording can show of it to the service's own model (bound.py).
     bearing_*: relative errors of the bearing pressure; bearing_sd the relative deviation reported in the end.
     """
 
@@ -58,6 +60,7 @@ class Trial:
     bearing_after: float
     bearing_sd: float
     seconds: float
+    bound: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Plain objects."""
@@ -79,6 +82,7 @@ def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown |
     candidates = possible_effects(case.config) if candidates is None else candidates
     if truth is None:
         truth = shown(case) if case.parts else NOTHING
+    least = bound(case) if case.parts else None
     begin = time.process_time()
     reported: dict[str, Any] = FAILED
     try:
@@ -110,6 +114,7 @@ def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown |
         visible=truth.energy,
         true_gap=truth.gap,
         seconds=time.process_time() - begin,
+        bound=least,
         **reported,
     )
 

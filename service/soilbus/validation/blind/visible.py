@@ -65,8 +65,8 @@ def shown(case: Case) -> Shown:
 
     SimulationError if it cannot be driven.
     """
-    whole = _driven(case, case.parts)
-    left = [_driven(case, case.parts[:i] + case.parts[i + 1 :]) for i in range(len(case.parts))]
+    whole = driven_without_noise(case, case.parts)
+    left = [driven_without_noise(case, case.parts[:i] + case.parts[i + 1 :]) for i in range(len(case.parts))]
     count = int(min(recording.truth["t"][-1] for recording in (whole, *left)) / BIN)
     found = []
     for recording in left:
@@ -77,7 +77,7 @@ def shown(case: Case) -> Shown:
     return min(found, key=lambda each: each.energy)
 
 
-def _driven(case: Case, parts: tuple[Hidden, ...]) -> Recording:
+def driven_without_noise(case: Case, parts: tuple[Hidden, ...]) -> Recording:
     """The drive with these parts, and sensors without noise or gain errors."""
     how = together(parts)
     driven = simulate(how.tractor(_quiet(case.config)), how.way(case.scenario), case.seed, how.effects)
