@@ -72,7 +72,7 @@ def detectable(
     """The detectable size of every candidate beside the present model fitted to these recordings."""
     options = records[0].options
     divisor = temperature(present.excess, options)
-    required = required_fall_beside(present, divisor, options)
+    required = required_fall_beside(records, present, divisor, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
     for effects in _with_further_starts(candidates):

@@ -203,7 +203,7 @@ class Search:
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
         """Whether an effect explains less than the required fall."""
-        required = required_fall_beside(without, self.temperature, self.options)
+        required = required_fall_beside(self.full.records, without, self.temperature, self.options)
         return without.neg2_log_evidence - model.neg2_log_evidence < required
 
     def _is_sampling_delay(self, without: FittedModel, model: FittedModel) -> bool:
@@ -216,13 +216,16 @@ class Search:
         )
 
 
-def required_fall_beside(model: FittedModel, divisor: float, options: DiagnosisOptions = DEFAULT) -> float:
+def required_fall_beside(
+    records: Sequence[Record], model: FittedModel, divisor: float, options: DiagnosisOptions = DEFAULT
+) -> float:
     """Fall of -2 log evidence from which an effect is added to a model, at a temperature.
 
-    Where loads are computed all of the excess counts, not only a gap beyond noise: loads shake, wheels slip by it, and
-    a false effect follows a good part of that (a sixth of the excess in drives whose loads shake by 12 %).
+    Where loads left and right are computed all of the excess counts, not only a gap beyond noise: loads shake, wheels
+    slip by it, and a false effect follows a good part of that (a sixth of the excess in drives whose loads shake by
+    12 %).
     """
-    if model.checks[0].problem.computes_sides:
+    if any(record.training.computes_sides for record in records):
         return max(least_required_fall(divisor), options.least_gap_share * model.excess)
     return required_fall(divisor, model.gap, model.checked_rows, model.rows, options)
 

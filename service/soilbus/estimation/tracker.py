@@ -25,7 +25,7 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -92,7 +92,8 @@ class TrackerOptions:
     settled_sd
         The same just after a border: its remains in the window bias the soil long before they are a mismatch.
     min_evidence_gain
-        Fall of -2 log evidence by two soils instead of one from which the change is accepted.
+        Fall of -2 log evidence by two soils instead of one from which the change is accepted, and of -2 log posterior,
+        beyond the number of residuals left out, from which these are part of the transition.
     max_scale_statistic
         Score statistic, chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd.
     min_rows_per_soil
@@ -105,6 +106,8 @@ class TrackerOptions:
         Windows that the data must fill for the posterior to be a later prior: with less it is not Gaussian.
     max_unexplained
         Windows after a change point during which a change may explain a mismatch.
+    extension_shares
+        Shares of a new soil's data that are tried as part of its transition.
     transition_lengths
         Lengths of a transition that are tried, in wheelbases: borders are sharp or gradual.
     default_wheelbase
@@ -124,6 +127,7 @@ class TrackerOptions:
     min_to_detect: float = 0.3
     min_to_learn: float = 0.5
     max_unexplained: float = 2.0
+    extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
     transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
     default_wheelbase: float = 2.0
     gain_memory: float = 60.0
@@ -531,6 +535,8 @@ class Tracker:
             return two
         if self.mismatch(one.fit) and self._budget.allows():
             one = self._another_soil(present, one if one.warm is None else self._searched(present))
+        if one.found or self._state.spans_border(present.end - self.settings.window):
+            one = self._after_longer_transition(present, one)
         return one
 
     def _two_soils(self, present: _Present, one: _Explanation, change: ChangePoint) -> _Explanation | None:
@@ -550,7 +556,9 @@ class Tracker:
             return None
         joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
         candidates = self._candidate_transitions(change, float(window.t[0]))
-        new = self._after_transition(window, candidates, joint_prior)
+        new = self._after_transition(
+            window, candidates, self._new_soil_prior, joint_prior, lambda fit: not self.mismatch(fit)
+        )
         if new is not None and new.transition is not None:
             separated = without_transition(window, new.transition, self.rig.front)
             whole = present._replace(window=separated, problem=self._problem(separated))
@@ -563,13 +571,17 @@ class Tracker:
         return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
 
     def _after_transition(
-        self, window: Window, transitions: Iterable[Transition], joint_prior: Gaussian
+        self,
+        window: Window,
+        transitions: Iterable[Transition],
+        prior: SoilPrior,
+        joint_prior: Gaussian,
+        is_one_soil: Callable[[Fit], bool],
     ) -> _Explanation | None:
-        """The data after the first of some transitions, of growing length, that leaves one soil, a new one.
+        """The data after the first of some transitions, of growing length, that leaves one soil.
 
         None where none does, or too few data are left.
         """
-        prior = self._new_soil_prior
         for transition in transitions:
             separated = without_transition(window, transition, self.rig.front)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
@@ -577,7 +589,7 @@ class Tracker:
             if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
                 return None  # after a mismatch both axles and the draft must agree on the new soil
             fit = self._search(problem, prior, joint_prior)
-            if fit is not None and not self.mismatch(fit):
+            if fit is not None and is_one_soil(fit):
                 return _Explanation(Objective(problem, prior, joint_prior), fit, transition.end, None, None, transition)
         return None
 
@@ -607,6 +619,20 @@ class Tracker:
         begin = float(present.problem.t[0])
         objective = Objective(present.problem, self._new_soil_prior, joint_prior)
         return _Explanation(objective, other, begin, None, Reason.ANOTHER_SOIL, Transition(begin, begin, 0.0))
+
+    def _after_longer_transition(self, present: _Present, one: _Explanation) -> _Explanation:
+        """The new soil after a longer transition, if the data that it leaves out are why the others do not agree."""
+        if one.fit is None or self._is_settled(one.fit) or one.transition is None:
+            return one
+        prior, joint_prior = one.objective.coordinates.prior, one.objective.joint_prior
+        begin, last = max(one.transition.end, float(present.window.t[0])), float(present.window.t[-1])
+        ends = (begin + share * (last - begin) for share in self.options.extension_shares)
+        longer = (one.transition._replace(end=end) for end in ends)
+        after = self._after_transition(present.window, longer, prior, joint_prior, self._is_settled)
+        if after is None or after.fit is None:
+            return one
+        fall = one.fit.neg2_log_posterior - after.fit.neg2_log_posterior - (one.fit.rows - after.fit.rows)
+        return after._replace(found=one.found or Reason.SPANS_BORDER) if fall > self.options.min_evidence_gain else one
 
     def _search(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
         """A fit from many starts; None also where the budget allows no search."""
