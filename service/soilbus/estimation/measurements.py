@@ -177,10 +177,11 @@ class Measurements:
     def on_curves(self) -> Self:
         """The same with latents on smooth curves of what is measured, and side loads by equal torques.
 
-        Latents fitted to an instant are free of the residuals' noise where S is the residuals' covariance.  Computed
-        loads leave more open than they vary by: S is several times too large, the latents keep their noise, and
-        derivatives taken there go with the residuals.  On the channels' curves they do not (regression calibration:
-        Carroll et al. 2006, Measurement Error in Nonlinear Models, ch. 4).
+        Latents at their conditional optimum are uncorrelated with the residuals if these are weighed by their true
+        covariance.  Computed loads leave more open than they vary by, so the assumed one is several times too large:
+        the latents keep their sensors' noise, and the Jacobian taken there correlates with the residuals.  On the
+        channels' smooth curves it does not (regression calibration: Carroll et al. 2006, Measurement Error in Nonlinear
+        Models, ch. 4).
 
         Wheels with equal torques behind an open differential slip by their loads.  Where nothing measures the loads
         left and right, T_left(W_left) = T_right(W_right) fixes their difference, as T = 0 fixes the slip of a free
@@ -190,25 +191,25 @@ class Measurements:
         """
         if not self.computes_sides:
             return self
-        calm = copy(self)
-        calm.has_torque, calm._known, calm._measured_var = (
+        smooth = copy(self)
+        smooth.has_torque, smooth._known, smooth._measured_var = (
             a.copy() for a in (self.has_torque, self._known, self._measured_var)
         )
-        calm._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
-        calm._side_columns = [load for _, load in self._sides]
+        smooth._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
+        smooth._side_columns = [load for _, load in self._sides]
         for torque, load in self._sides:
-            calm.has_torque[:, torque] = calm._known[:, torque] = False
-            calm._measured_var[self.has_torque[:, torque], load] = 0.0
-        calm._row_var = np.where(calm._known, self._row_var, 1.0)
-        calm._count()
+            smooth.has_torque[:, torque] = smooth._known[:, torque] = False
+            smooth._measured_var[self.has_torque[:, torque], load] = 0.0
+        smooth._row_var = np.where(smooth._known, self._row_var, 1.0)
+        smooth._count()
         noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
         of_draft, of_inertia = (
             off_curve(self.t, *column)[:, None]
             for column in ((self.draft, self.draft_var), (self.inertia, self.inertia_var))
         )
         of_computed = self.by_draft * of_draft + self.by_inertia * of_inertia
-        calm._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
-        return calm
+        smooth._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
+        return smooth
 
     def _observe(self) -> None:
         """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""

@@ -69,9 +69,6 @@ FIRST_GAIN = SOIL.stop
 """Column of the first nuisance parameter: the sensor gains, then the effect parameters."""
 TIME_TOLERANCE = 1e-3
 """Times [s] closer than this are those of one bin."""
-MAX_SIDE_STEP, MAX_SIDE = 0.2, 0.8
-"""Difference of the loads left and right of an axle over their sum: in one Newton step, as torque is curved in it, and
-at all, as none of the wheels leaves the ground."""
 _TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
 """Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
 _DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
@@ -527,12 +524,12 @@ class ObservationModel(Measurements):
         found = now[:, self._side_columns]
         if self._side_known is None:
             return found
-        off = self.torque_rows(torque)
+        off, most = self.torque_rows(torque), self.options.measurements.max_side_load
         for s, (row, column) in enumerate(self._sides):
             axle, slope = self._measured[:, column], -A[:, row, column]
             step = np.divide(-off[:, row], slope, out=np.zeros(self.n), where=slope > 0.0)
-            step = np.clip(step, -MAX_SIDE_STEP * axle, MAX_SIDE_STEP * axle) * self._side_known[:, s]
-            found[:, s] = np.clip(found[:, s] + step, (1.0 - MAX_SIDE) * axle, (1.0 + MAX_SIDE) * axle)
+            found[:, s] += step * self._side_known[:, s]
+            found[:, s] = np.clip(found[:, s], (1.0 - most) * axle, (1.0 + most) * axle)
         return found
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
