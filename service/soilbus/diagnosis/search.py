@@ -24,7 +24,6 @@ from soilbus.diagnosis.score import Score, further_scores, scores
 from soilbus.diagnosis.verdict import (
     dominated_deficit,
     gap_limit,
-    least_required_fall,
     mean_soil_error_share,
     probabilities,
     required_fall,
@@ -225,9 +224,8 @@ def required_fall_beside(
     slip by it, and a false effect follows a good part of that (a sixth of the excess in drives whose loads shake by
     12 %).
     """
-    if any(record.training.computes_sides for record in records):
-        return max(least_required_fall(divisor), options.least_gap_share * model.excess)
-    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options)
+    excess = model.excess if any(record.training.computes_sides for record in records) else None
+    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options, excess)
 
 
 class FitCache:

@@ -90,7 +90,12 @@ def temperature_of_all(temperatures: Sequence[float], options: DiagnosisOptions 
 
 
 def required_fall(
-    divisor: float, gap: float, checked_rows: int, rows: int, options: DiagnosisOptions = DEFAULT
+    divisor: float,
+    gap: float,
+    checked_rows: int,
+    rows: int,
+    options: DiagnosisOptions = DEFAULT,
+    excess: float | None = None,
 ) -> float:
     """Fall of -2 log evidence from which an effect is added.
 
@@ -102,8 +107,11 @@ def required_fall(
         Reduced chi-square under the present model, and the number of held-out residuals of which it is.
     rows
         Residuals of all blocks.
+    excess
+        Of all blocks' chi-square over the expected one, where all of it counts; else that of a gap beyond noise.
     """
-    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows, options) else 0.0
+    if excess is None:
+        excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows, options) else 0.0
     return max(least_required_fall(divisor), options.least_gap_share * excess)
 
 
