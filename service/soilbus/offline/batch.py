@@ -12,22 +12,24 @@ it is sent along.
 from __future__ import annotations
 
 import csv
+import fcntl
 import glob
 import hashlib
 import json
 import logging
 import math
+import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +45,31 @@ from soilbus.offline.fleet import (
     judged,
     no_findings,
 )
-from soilbus.offline.parts import Job, OtherVersion, Outcome, Setup, part_of, setup_of, summary_of_part
+from soilbus.offline.parts import (
+    Job,
+    OtherVersion,
+    Outcome,
+    Setup,
+    file_name,
+    part_of,
+    place_of,
+    setup_of,
+    summary_of_part,
+)
+from soilbus.offline.tables import MISSING_CELLS
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
-__all__ = ["Batch", "BatchError", "check_new", "cluster", "jobs_of", "run_batch"]
+__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch"]
 
 LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
 """Of logs that python-can reads; each may have .gz behind it."""
 TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
+MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
+SEPARATORS = ",;\t"
+"""Between the cells of a manifest; a spreadsheet writes semicolons where the comma is in numbers."""
+CAN_CSV_COLUMNS = 7
+"""Of a log in the CSV of python-can."""
 CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
 TASKS_PER_THREAD = 3
@@ -140,64 +158,96 @@ def jobs_of(config: Config, name: str, logs: Sequence[str], load: Callable[[Path
     setup(None)
     jobs: dict[str, Job] = {}
     for argument in logs:
-        for entry in _entries(argument):
+        for entry in _entries(argument, config.table is not None):
             found = _files(entry["log"], suffixes)
             if not found:
                 raise BatchError(f"{entry['log']}: no log there")
             for log in found:
-                vehicle = entry.get("vehicle") or log.rpartition("/")[0].rpartition("/")[2] or "unknown"
+                vehicle = entry.get("vehicle") or place_of(log).rpartition("/")[0].rpartition("/")[2] or "unknown"
+                if not dataset.can_be_folder(vehicle):
+                    raise BatchError(f"{argument}: vehicle {vehicle[:60]!r}: no name that a folder of results can have")
                 own = entry.get("configuration")
                 job = Job(log, vehicle, setup(Path(own) if own else None), _start(entry.get("start"), argument))
                 jobs[job.digest] = job
     return sorted(jobs.values(), key=lambda job: (job.vehicle, job.log, job.digest))
 
 
-def _entries(argument: str) -> list[dict[str, str]]:
-    """Rows of a manifest, or one row that names the argument itself."""
+def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
+    """Rows of a manifest, or one row that names the argument itself, which may be a table of a test rig."""
     path = Path(argument)
-    if path.suffix not in (".csv", ".parquet") or not path.is_file():
+    if path.suffix.lower() not in TABLE_SUFFIXES or not path.is_file():
         return [{"log": argument}]
     try:
-        if path.suffix == ".csv":
-            with path.open(newline="", encoding="utf-8-sig") as text:
-                table = csv.DictReader(text)
-                rows = [dict(row) for row in table] if "log" in (table.fieldnames or ()) else []
-        else:
-            rows = _parquet_rows(path)
+        header, rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _parquet_rows(path)
     except (OSError, ValueError, csv.Error) as error:
         raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
+    if "log" not in header:
+        if tables or len(header) in (0, CAN_CSV_COLUMNS):
+            return [{"log": argument}]
+        raise BatchError(f"{argument}: a manifest needs a column log; its columns are {', '.join(header) or 'none'}")
     if not rows:
-        return [{"log": argument}]
-    return [_entry(path, row) for row in rows]
+        raise BatchError(f"{argument}: no row in it")
+    return [_entry(path, number, row) for number, row in rows]
 
 
-def _entry(manifest: Path, row: Mapping[str, Any]) -> dict[str, str]:
+def _entry(manifest: Path, number: int, row: Mapping[str, Any]) -> dict[str, str]:
     """A row's texts; paths in it begin at the manifest's folder."""
-    texts = {name: str(value).strip() for name, value in row.items() if value is not None}
-    if not texts.get("log"):
-        raise BatchError(f"{manifest}: a row without a log")
+    texts = {name: _cell(row[name]) for name in MANIFEST_COLUMNS if name in row}
+    if not texts["log"]:
+        raise BatchError(f"{manifest}: row {number} has no log")
     for name in ("log", "configuration"):
-        if texts.get(name) and "://" not in texts[name]:
-            texts[name] = str(manifest.parent / texts[name])
+        text = texts.get(name)
+        if text and "://" not in text and not (name == "configuration" and _is_machine(manifest.parent / text)):
+            texts[name] = str(manifest.parent / text)
     return texts
 
 
-def _parquet_rows(path: Path) -> list[dict[str, Any]]:
+def _cell(value: Any) -> str:
+    """Text of a cell, empty where it is missing; pandas makes 7.0 of a whole number where others are missing."""
+    if value is None or value != value:
+        return ""
+    return str(int(value) if isinstance(value, float) and value.is_integer() else value).strip()
+
+
+def _is_machine(configuration: Path) -> bool:
+    """Whether this can only be the name of a reference machine."""
+    return not configuration.suffix and not configuration.exists()
+
+
+def _csv_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+    """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
+    with path.open(newline="", encoding="utf-8-sig") as text:
+        first = text.readline()
+        text.seek(0)
+        table = csv.reader(text, delimiter=max(SEPARATORS, key=first.count), strict=True)
+        header = [name.strip().lower() for name in next(table, [])]
+        if "log" not in header:
+            return header, []
+        return header, [
+            (table.line_num, dict(zip(header, row, strict=False))) for row in table if any(map(str.strip, row))
+        ]
+
+
+def _parquet_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+    """Names of columns, and the numbered rows of a manifest."""
     import pyarrow.parquet as pq
 
-    names = pq.read_schema(path).names
-    wanted = [name for name in ("log", "vehicle", "configuration", "start") if name in names]
-    rows: list[dict[str, Any]] = pq.read_table(path, columns=wanted).to_pylist() if "log" in names else []
-    return rows
+    columns = pq.read_schema(path).names
+    header = [name.strip().lower() for name in columns]
+    if "log" not in header:
+        return header, []
+    wanted = [name for name, plain in zip(columns, header, strict=True) if plain in MANIFEST_COLUMNS]
+    table = pq.read_table(path, columns=wanted)
+    rows = table.rename_columns([name.strip().lower() for name in table.column_names]).to_pylist()
+    return header, list(enumerate(rows, 1))
 
 
 def _start(text: str | None, manifest: str) -> float | None:
-    if not text:
+    if not text or text.lower() in MISSING_CELLS:
         return None
-    try:
-        return float(text)
-    except ValueError:
-        pass
+    with suppress(ValueError):
+        if math.isfinite(seconds := float(text)):
+            return seconds
     try:
         when = datetime.fromisoformat(text)
     except ValueError:
@@ -209,25 +259,51 @@ def _files(log: str, suffixes: Sequence[str]) -> list[str]:
     """The logs that a path, a folder, a glob or a URL stands for; of a folder all below it that can be logs."""
     if "://" in log:
         return _remote_files(log, suffixes)
-    path = Path(log)
-    if path.is_dir():
-        return sorted(str(each.resolve()) for each in path.rglob("*") if _is_log(each.name, suffixes))
-    if glob.has_magic(log) and not path.exists():
-        return sorted(str(Path(each).resolve()) for each in glob.glob(log, recursive=True) if Path(each).is_file())
-    return [str(path.resolve())]
+    found = [log]
+    if glob.has_magic(log) and not os.path.lexists(log):
+        found = glob.glob(log, recursive=True)
+    below = (_below(each, suffixes) if os.path.isdir(each) else [os.path.abspath(each)] for each in found)
+    return sorted(set(chain.from_iterable(below)))
+
+
+def _below(folder: str, suffixes: Sequence[str]) -> list[str]:
+    """What is named as logs are below a folder, behind links too, and each folder that cannot be read."""
+    found: list[str] = []
+    root = os.path.abspath(folder)
+    walk = os.walk(root, followlinks=True, onerror=lambda error: found.append(error.filename))
+    for place, folders, names in walk:
+        folders[:] = [name for name in folders if not _is_double(Path(place, name), Path(root))]
+        logs = [Path(place, name) for name in (*folders, *names) if _is_log(name, suffixes)]
+        found += [
+            str(log) for log in logs if not (_is_double(log, Path(root)) and _is_log(log.resolve().name, suffixes))
+        ]
+    return found
+
+
+def _is_double(path: Path, root: Path) -> bool:
+    """Whether this is a link to what is found below `root` anyway, or to a folder that it lies in itself."""
+    if not path.is_symlink():
+        return False
+    target, ends = Path(os.path.realpath(path)), len(root.parents)
+    above = [each for each in path.parents if len(each.parents) >= ends]
+    return target.is_relative_to(os.path.realpath(root)) or any(
+        Path(os.path.realpath(each)).is_relative_to(target) for each in above
+    )
 
 
 def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
     from fsspec.core import url_to_fs
 
+    place, _, archive = url.partition("::")
+    archive = f"::{archive}" if archive and "://" in place else ""
     try:
         files, name = url_to_fs(url)
-        if glob.has_magic(name):
-            return sorted(str(files.unstrip_protocol(each)) for each in files.glob(name))
+        if glob.has_magic(place_of(url)):
+            return sorted(str(files.unstrip_protocol(each)) + archive for each in files.glob(name))
         # over HTTP a file that is asked whether it is a folder is read as a page of links
-        if not _is_log(name, suffixes) and files.isdir(name):
+        if not _is_log(file_name(url), suffixes) and files.isdir(name):
             found = [each for each in files.find(name) if _is_log(each, suffixes)]
-            return sorted(str(files.unstrip_protocol(each)) for each in found)
+            return sorted(str(files.unstrip_protocol(each)) + archive for each in found)
     except Exception as error:  # each protocol has its own
         raise BatchError(f"{url}: {one_line(error, 150)}") from None
     return [url]
@@ -261,7 +337,9 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
     dask: Any = import_module("dask")
     distributed: Any = import_module("distributed")  # typed only in part
     # Dask speaks of every worker that is lost; what it means for a log we say ourselves
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in list(logging.root.manager.loggerDict):  # Dask sets a level for some of them
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     settings = {
         "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
         "distributed.client.scheduler-info-interval": 2000,
@@ -282,7 +360,7 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
         try:
             with warnings.catch_warnings(category=distributed.versions.VersionMismatchWarning, action="ignore"):
                 client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
-        except (OSError, TimeoutError, ValueError) as error:
+        except (OSError, TimeoutError, TypeError, ValueError) as error:  # TypeError: TLS without a certificate
             raise BatchError(f"{address}: no Dask scheduler there ({one_line(error, 100)})") from None
         with client:
             _check_workers(client, address)
@@ -366,10 +444,34 @@ def done_in_turn(
 # --- the batch
 
 
-def check_new(out: Path) -> None:
-    """Raises ConfigError where a folder holds parts of an earlier run."""
-    if any((out / "parts").glob("*")):
+def check_out(out: Path, resume: bool) -> None:
+    """Raises ConfigError where a folder holds results and no run is resumed, or other files that would be replaced."""
+    if not resume and any((out / "parts").glob("*")):
         raise ConfigError([f"--out {out}: it holds results: go on with --resume, or take another folder"])
+    if out.exists() and not out.is_dir():
+        raise ConfigError([f"--out {out}: a file, no folder"])
+    taken = [name for name in dataset.RESULTS if (out / name).exists()]
+    if taken and not (resume and (out / "parts").is_dir()):
+        what = f"it has no parts of a batch, but {taken[0]}, which would be replaced: take another folder"
+        raise ConfigError([f"--out {out}: {what}"])
+
+
+@contextmanager
+def results_in(out: Path) -> Iterator[None]:
+    """A folder for results that no other process writes to meanwhile; BatchError where one does, OSError."""
+    (out / "parts").mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(out, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise BatchError(f"{out}: another soilbus batch writes its results there") from None
+    except OSError:  # a network's file system without locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def run_batch(
@@ -429,6 +531,8 @@ def run_batch(
     dataset.write_rows(out / "errors.parquet", errors, dataset.ERROR_COLUMNS)
     if logs:
         dataset.write_rows(out / "logs.parquet", logs)
+    else:
+        (out / "logs.parquet").unlink(missing_ok=True)
     dataset.write_rows(out / "vehicles.parquet", vehicles)
     return Batch(
         vehicles,
@@ -585,9 +689,11 @@ def _write_windows(
 ) -> None:
     """The parts as tables by vehicle and day, and the map of them."""
     new, windows, vehicles = out / ".windows", out / "windows", {job.digest: job.vehicle for job in jobs}
-    if not summaries:
-        return
     shutil.rmtree(new, ignore_errors=True)  # of a run that was stopped
+    if not summaries:
+        shutil.rmtree(windows, ignore_errors=True)
+        (out / "map.parquet").unlink(missing_ok=True)
+        return
     columns = dataset.window_columns(summaries.values())
     tasks = ((digest, (_part_path(out / "parts", digest).read_bytes(), columns)) for digest in summaries)
     for n, (digest, files) in enumerate(done_in_turn(client, dataset.day_files, tasks), 1):

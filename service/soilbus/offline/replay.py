@@ -49,9 +49,13 @@ MAX_PENDING_WINDOWS = 30
 
 
 class LogError(Exception):
-    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place."""
+    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place.
+
+    `lasting` is False where the fault is of the machine that reads it, not of what is in the log.
+    """
 
     windows = 0
+    lasting = True
 
 
 class OtherBus(LogError):
@@ -93,7 +97,9 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except NotImplementedError:
-        raise LogError(f"{path}: this format needs soilbus[mf4]") from None
+        fault = LogError(f"{path}: this format needs soilbus[mf4]")
+        fault.lasting = False
+        raise fault from None
     except Exception as error:  # python-can's readers raise all kinds on a damaged file
         what = "not a CAN log that can be read" if n == 0 else f"cut off or damaged after {n} frames"
         why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 100)

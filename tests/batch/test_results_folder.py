@@ -1,0 +1,70 @@
+"""The folder of results: one batch at a time, nobody else's files, nothing of earlier arguments left in it."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+import soilbus
+from soilbus.cli.main import main
+from soilbus.offline.batch import BatchError, cluster, jobs_of, results_in, run_batch
+from soilbus.offline.parts import Job, part_of, setup_of
+
+pytest.importorskip("distributed")
+
+
+def test_a_second_batch_into_the_same_folder_is_refused(tmp_path):
+    out = tmp_path / "out"
+    with results_in(out), pytest.raises(BatchError, match="another soilbus batch"), results_in(out):
+        pass
+    with results_in(out):
+        pass
+
+
+@pytest.mark.parametrize("resume", [[], ["--resume"]])
+def test_files_of_others_are_not_replaced(resume, tractor, logs, tmp_path, capsys):
+    (tmp_path / "windows").mkdir()
+    (tmp_path / "windows/house.txt").write_text("south side")
+    assert main(["batch", "--config", tractor, str(logs), "--out", str(tmp_path), *resume]) == 2
+    assert "windows, which would be replaced" in capsys.readouterr().err
+    assert (tmp_path / "windows/house.txt").read_text() == "south side"
+
+
+def test_a_file_in_place_of_the_folder_is_one_line(tractor, logs, tmp_path, capsys):
+    (tmp_path / "out").write_text("")
+    assert main(["batch", "--config", tractor, str(logs), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == f"soilbus: --out {tmp_path}/out: a file, no folder\n"
+
+
+def test_results_are_those_of_the_logs_of_the_last_run(client, config, logs, tmp_path):
+    run_batch(client, jobs_of(config, "t", [str(logs / "red/morning.log")], lambda _: config), tmp_path)
+    run_batch(client, jobs_of(config, "t", [str(logs / "blue/garbage.log")], lambda _: config), tmp_path)
+    assert {each.name for each in tmp_path.iterdir()} == {"parts", "errors.parquet", "vehicles.parquet"}
+
+
+def test_a_batch_that_is_interrupted_says_how_to_go_on(client, tractor, logs, tmp_path, capsys, monkeypatch):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("soilbus.offline.batch.run_batch", interrupted)
+    address = ["--scheduler", client.scheduler.address]
+    assert main(["batch", "--config", tractor, str(logs / "red"), "--out", str(tmp_path / "o"), *address]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "soilbus: stopped; --resume goes on from here"
+
+
+def test_dask_prints_nothing_of_a_lost_scheduler(client):
+    with cluster(client.scheduler.address, lambda _: None):
+        pass
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    assert [name for name in names if logging.getLogger(name).isEnabledFor(logging.ERROR)] == []
+
+
+def test_a_format_that_a_worker_lacks_is_no_fault_of_the_log(config, tmp_path, monkeypatch):
+    def lacking(_: object) -> None:
+        raise NotImplementedError
+
+    (tmp_path / "a.mf4").write_bytes(b"MDF     4.10")
+    monkeypatch.setattr("can.LogReader", lacking)
+    outcome = part_of(Job(str(tmp_path / "a.mf4"), "T7", setup_of(config, "t")), soilbus.__version__)
+    assert (outcome.fault, outcome.lasting) == (f"{tmp_path}/a.mf4: this format needs soilbus[mf4]", False)
