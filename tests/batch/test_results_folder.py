@@ -68,3 +68,27 @@ def test_a_format_that_a_worker_lacks_is_no_fault_of_the_log(config, tmp_path, m
     monkeypatch.setattr("can.LogReader", lacking)
     outcome = part_of(Job(str(tmp_path / "a.mf4"), "T7", setup_of(config, "t")), soilbus.__version__)
     assert (outcome.fault, outcome.lasting) == (f"{tmp_path}/a.mf4: this format needs soilbus[mf4]", False)
+
+
+def test_a_log_that_left_its_folder_keeps_its_windows(client, config, moved, tmp_path):
+    logs, out = tmp_path / "fleet/T7", tmp_path / "out"
+    logs.mkdir(parents=True)
+    for n in range(2):
+        (logs / f"{n}.log").write_text(moved(100.0 * n))
+
+    def batch(*arguments: object, **other: object):
+        of = config.model_copy(update=other)
+        return run_batch(client, jobs_of(of, "t", [str(each) for each in arguments], lambda _: of, out / "parts"), out)
+
+    assert batch(logs.parent).windows == 10
+    (logs / "0.log").unlink()
+    whole = (out / "logs.parquet").read_bytes()
+    for arguments in ([logs.parent], [logs], [f"{logs.parent}/*/*.log"], [f"{logs.parent}/T*"]):
+        again = batch(*arguments)
+        assert (again.windows, again.errors, again.resumed) == (10, [], 2)
+        assert (out / "logs.parquet").read_bytes() == whole
+    assert batch(logs / "1.log").windows == 5
+    (logs / "1.log").unlink()
+    assert batch(logs).windows == 10
+    with pytest.raises(BatchError, match="no log there"):
+        batch(logs, output=config.output.model_copy(update={"dbc": "other.dbc"}))

@@ -26,6 +26,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from fnmatch import fnmatchcase
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -123,7 +124,9 @@ class Batch:
 # --- from what the user names to jobs
 
 
-def jobs_of(config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config]) -> list[Job]:
+def jobs_of(
+    config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config], parts: Path | None = None
+) -> list[Job]:
     """The jobs that the arguments of the command stand for, in the order of vehicle and log.
 
     Parameters
@@ -135,6 +138,9 @@ def jobs_of(config: Config, name: str, logs: Sequence[str], load: Callable[[Path
         `configuration` and `start` (ISO 8601, or seconds since 1970).
     load
         Reads another configuration.
+    parts
+        Folder of parts to go on with: a log that was read before in a folder that is named here, and that is no longer
+        there, keeps its job.
 
     Returns
     -------
@@ -157,19 +163,45 @@ def jobs_of(config: Config, name: str, logs: Sequence[str], load: Callable[[Path
     suffixes = TABLE_SUFFIXES if config.table is not None else LOG_SUFFIXES
     setup(None)
     jobs: dict[str, Job] = {}
+    before = _logs_of_parts(parts)
     for argument in logs:
         for entry in _entries(argument, config.table is not None):
+            own = entry.get("configuration")
+            of_entry = partial(_job, entry, argument, setup(Path(own) if own else None))
             found = _files(entry["log"], suffixes)
-            if not found:
+            own_jobs = [of_entry(log) for log in found]
+            if found != [_absolute(entry["log"])]:
+                gone = {digest: log for digest, log in before.items() if _lies_in(log, entry["log"])}
+                own_jobs += [job for digest, log in gone.items() if (job := of_entry(log)).digest == digest]
+            if not own_jobs:
                 raise BatchError(f"{entry['log']}: no log there")
-            for log in found:
-                vehicle = entry.get("vehicle") or place_of(log).rpartition("/")[0].rpartition("/")[2] or "unknown"
-                if not dataset.can_be_folder(vehicle):
-                    raise BatchError(f"{argument}: vehicle {vehicle[:60]!r}: no name that a folder of results can have")
-                own = entry.get("configuration")
-                job = Job(log, vehicle, setup(Path(own) if own else None), _start(entry.get("start"), argument))
-                jobs[job.digest] = job
+            jobs |= {job.digest: job for job in own_jobs}
     return sorted(jobs.values(), key=lambda job: (job.vehicle, job.log, job.digest))
+
+
+def _job(entry: Mapping[str, str], argument: str, setup: Setup, log: str) -> Job:
+    vehicle = entry.get("vehicle") or place_of(log).rpartition("/")[0].rpartition("/")[2] or "unknown"
+    if not dataset.can_be_folder(vehicle):
+        raise BatchError(f"{argument}: vehicle {vehicle[:60]!r}: no name that a folder of results can have")
+    return Job(log, vehicle, setup, _start(entry.get("start"), argument))
+
+
+def _logs_of_parts(parts: Path | None) -> dict[str, str]:
+    """Logs of which there are parts, by digest."""
+    paths = [] if parts is None else sorted(parts.glob("*.gz"))
+    return {path.stem: summary["log"] for path in paths if (summary := summary_of_part(path)) is not None}
+
+
+def _lies_in(log: str, place: str) -> bool:
+    """Whether a log, there or not, is one that a folder or a glob stands for."""
+    pattern = _absolute(place).rstrip("/")
+    if not glob.has_magic(pattern):
+        return log.startswith(f"{pattern}/")
+    return fnmatchcase(log, pattern) or fnmatchcase(log, f"{pattern}/*")
+
+
+def _absolute(log: str) -> str:
+    return log if "://" in log else os.path.abspath(log)
 
 
 def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
@@ -262,7 +294,7 @@ def _files(log: str, suffixes: Sequence[str]) -> list[str]:
     found = [log]
     if glob.has_magic(log) and not os.path.lexists(log):
         found = glob.glob(log, recursive=True)
-    below = (_below(each, suffixes) if os.path.isdir(each) else [os.path.abspath(each)] for each in found)
+    below = (_below(each, suffixes) if os.path.isdir(each) else [_absolute(each)] for each in found)
     return sorted(set(chain.from_iterable(below)))
 
 
