@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 
 import pytest
 
@@ -92,3 +93,11 @@ def test_a_log_that_left_its_folder_keeps_its_windows(client, config, moved, tmp
     assert batch(logs).windows == 10
     with pytest.raises(BatchError, match="no log there"):
         batch(logs, output=config.output.model_copy(update={"dbc": "other.dbc"}))
+
+
+def test_the_configuration_of_the_current_folder_is_taken(client, tractor, logs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(tractor, "soilbus.toml")
+    arguments = ["--set", "estimator.window=4", "--out", "o", "--scheduler", client.scheduler.address]
+    assert main(["batch", str(logs / "red/morning.log"), *arguments]) == 0
+    assert "1 of 1 logs done" in capsys.readouterr().out

@@ -371,7 +371,7 @@ def batch(args: argparse.Namespace) -> None:
     check_out(args.out, args.resume or args.retry)
     try:
         parts = args.out / "parts" if args.resume or args.retry else None
-        jobs = jobs_of(config, Path(args.config).name, args.logs, own, parts)
+        jobs = jobs_of(config, Path(args.config or found_configuration(None)).name, args.logs, own, parts)
         with phases("batch") as progress, cluster(args.scheduler, say) as client, results_in(args.out):
             done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose, args.retry)
     except BatchError as error:
