@@ -9,6 +9,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
+import soilbus
+from soilbus.config.file import load_config
 from soilbus.offline.batch import BatchError, jobs_of, run_batch
 
 pd = pytest.importorskip("pandas")
@@ -142,3 +144,16 @@ def test_a_query_is_no_part_of_a_logs_name(config):
     url = "https://store.example/T7/a.log.gz?token=a/b*"
     (job,) = jobs_of(config, "t", [url], lambda _: config)
     assert (job.vehicle, job.log, urlsplit(job.log).query) == ("T7", url, "token=a/b*")
+
+
+def test_tables_of_a_test_rig_are_logs(client, tmp_path):
+    notebooks = Path(soilbus.__file__).parents[1] / "docs/notebooks"
+    config = load_config(notebooks / "rig.toml")
+    Path("m.csv").write_text(f"log,vehicle\n{notebooks / 'rig.csv'},bench\n")
+    assert [job.vehicle for job in jobs_of(config, "t", [str(notebooks / "rig.csv")], lambda _: config)] == [
+        "notebooks"
+    ]
+    run_batch(client, jobs_of(config, "t", ["m.csv"], lambda _: config), Path("out"))
+    windows = pd.read_parquet("out/windows").set_index("log")
+    assert set(windows.index) == {f"{notebooks}/rig.csv, {bed}" for bed in ("loose", "compacted")}
+    assert (windows["soil.k_phi.value"] > 0).all()

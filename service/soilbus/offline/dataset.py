@@ -21,7 +21,7 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from soilbus.export.table import arrow_schema, arrow_table
+from soilbus.export.table import arrow_schema, arrow_table, table_columns
 from soilbus.files import whole_file_of_bytes
 from soilbus.offline.parts import rows_of_part
 from soilbus.pipeline.outputs import column_names
@@ -90,7 +90,7 @@ def _day(milliseconds: int | None) -> str:
 
 def window_columns(summaries: Iterable[Mapping[str, Any]]) -> list[str]:
     """Columns of all windows: those of every part; the vehicle is in the folder's name."""
-    return [c for c in column_names(dict.fromkeys(s["columns"]) for s in summaries) if c != "vehicle"]
+    return [c for c in table_columns(dict.fromkeys(s["columns"]) for s in summaries) if c != "vehicle"]
 
 
 def folder_of(windows: Path, vehicle: str, day: str) -> Path:
@@ -126,7 +126,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[
     import pyarrow.parquet as pq
 
     out = BytesIO()
-    pq.write_table(arrow_table(rows, arrow_schema(columns or column_names(rows))), out)
+    pq.write_table(arrow_table(rows, arrow_schema(columns or table_columns(rows))), out)
     put(path, out.getvalue())
 
 

@@ -299,7 +299,8 @@ def _part_by_way_of(lines: IO[bytes], job: Job, config: Config, database: Databa
         pipeline = None if database is None else Pipeline(config, database)
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
-                row = summary.row(replace(result, log=job.log))
+                run = (result.log or "").removeprefix(path.name) if pipeline is None else ""  # of a table: its soil bed
+                row = summary.row(replace(result, log=job.log + run))
                 out.write(json.dumps(row, allow_nan=False).encode() + b"\n")
         except LogError as error:
             fault = error
