@@ -101,3 +101,16 @@ def test_the_configuration_of_the_current_folder_is_taken(client, tractor, logs,
     arguments = ["--set", "estimator.window=4", "--out", "o", "--scheduler", client.scheduler.address]
     assert main(["batch", str(logs / "red/morning.log"), *arguments]) == 0
     assert "1 of 1 logs done" in capsys.readouterr().out
+
+
+def test_a_damaged_part_is_named_with_what_to_do(client, config, logs, tmp_path):
+    own = jobs_of(config, "t", [str(logs / "red/morning.log")], lambda _: config)
+    run_batch(client, own, tmp_path)
+    whole = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    (part,) = (tmp_path / "parts").glob("*.gz")
+    part.write_bytes(part.read_bytes()[:-100])
+    with pytest.raises(BatchError, match=f"{part}: cannot be converted .*: delete it, and --resume"):
+        run_batch(client, own, tmp_path)
+    part.unlink()
+    assert run_batch(client, own, tmp_path).windows == 5
+    assert {path: path.read_bytes() for path in whole} == whole

@@ -730,7 +730,8 @@ def _write_windows(
     tasks = ((digest, (_part_path(out / "parts", digest).read_bytes(), columns)) for digest in summaries)
     for n, (digest, files) in enumerate(done_in_turn(client, dataset.day_files, tasks), 1):
         if isinstance(files, BaseException):
-            raise BatchError(f"the part {digest} cannot be converted ({one_line(Exception(str(files)), 100)})")
+            part, why = _part_path(out / "parts", digest), one_line(Exception(str(files)), 100)
+            raise BatchError(f"{part}: cannot be converted ({why}): delete it, and --resume reads its log again")
         for day, content in files.items():
             dataset.put(dataset.folder_of(new, vehicles[digest], day) / f"{digest}.parquet", content)
         progress(f"tables of {n} of {len(summaries)} logs")
