@@ -8,10 +8,12 @@ overlap in two processes, and the results are the same as in one.
 
 from __future__ import annotations
 
+import gc
 import gzip
 import math
 import os
 import sys
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
@@ -112,7 +114,16 @@ def _reader(path: Path) -> Any:
     """python-can's reader; it does not recognise a name such as a.b.log.gz, which is done here."""
     if path.suffixes[-2:] == [".log", ".gz"]:
         return can.CanutilsLogReader(gzip.open(path, "rt"))
-    return can.LogReader(path)
+    usual = sys.unraisablehook
+    try:
+        return can.LogReader(path)
+    except Exception as error:
+        sys.unraisablehook = lambda _: None  # asammdf's destructor fails on what its constructor has left unmade
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+        raise
+    finally:
+        sys.unraisablehook = usual
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:
