@@ -55,6 +55,10 @@ class DiagnosisOptions:
     least_gap_share: float = 0.25
     """Share [1] of a real gap's excess over noise that an effect must explain to be added.  Without it 6 of 18 cases
     outside the catalogue (seeds 211 and 212) get names beside the verdict `unknown`, with it 2."""
+    max_formula_error: float = 0.1
+    """Share [1] of what effects change by which their formulas are off: a further one that explains less than its
+    square of what they explain is none.
+    TODO"""
     named_probability: float = 0.8
     """Probability from which a name stands alone: the meaning of `named`."""
     set_probability: float = 0.02

@@ -76,8 +76,10 @@ class Search:
         Effects that may be missing.
     options
         Of the diagnosis.
+    excess
+        What the recordings leave without effects, see excess_without_effects().
     temperature
-        Of the recordings, by what the base leaves.
+        By that excess.
     """
 
     full: FitCache
@@ -85,11 +87,13 @@ class Search:
     base: FittedModel
     candidates: Sequence[Effect]
     options: DiagnosisOptions = DEFAULT
+    excess: float = field(init=False)
     temperature: float = field(init=False)
     _compared: dict[frozenset[str], dict[str, FittedModel]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.temperature = temperature(self.base.excess, self.options)
+        self.excess = excess_without_effects(self.full.records, self.full.prior, self.base)
+        self.temperature = temperature(self.excess, self.options)
 
     def steps(self) -> Iterator[tuple[list[Addition], FittedModel]]:
         """After each addition and its swaps: the additions in the order of the model's effects, and the model."""
@@ -202,7 +206,7 @@ class Search:
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
         """Whether an effect explains less than the required fall."""
-        required = required_fall_beside(self.full.records, without, self.temperature, self.options)
+        required = required_fall_beside(self.full.records, without, self.excess, self.options)
         return without.neg2_log_evidence - model.neg2_log_evidence < required
 
     def _is_sampling_delay(self, without: FittedModel, model: FittedModel) -> bool:
@@ -215,17 +219,34 @@ class Search:
         )
 
 
-def required_fall_beside(
-    records: Sequence[Record], model: FittedModel, divisor: float, options: DiagnosisOptions = DEFAULT
-) -> float:
-    """Fall of -2 log evidence from which an effect is added to a model, at a temperature.
+def excess_without_effects(records: Sequence[Record], prior: SoilPrior, present: FittedModel) -> float:
+    """Excess of the squared residuals without those effects of the present model whose sizes are fitted.
 
-    Where loads left and right are computed all of the excess counts, not only a gap beyond noise: loads shake, wheels
-    slip by it, and a false effect follows a good part of that (a sixth of the excess in drives whose loads shake by
-    12 %).
+    What these explain counts as what a search explains: their formulas are not the field's either.  Not so those of
+    the vehicle's type (Record.of_type).
     """
-    excess = model.excess if any(record.training.computes_sides for record in records) else None
-    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options, excess)
+    free, excess = present.free_unheld, present.excess
+    fitted = {f.effect for f in free if f.std > 0.0} - records[0].of_type
+    if fitted:
+        kept = [effect for effect in present.effects if effect.name not in fitted]
+        given = [f for f in free if f.effect not in fitted]
+        without = fit_model([record.with_effects(kept, given) for record in records], prior, kept)
+        excess = excess if without is None else max(excess, without.excess)
+    return excess
+
+
+def required_fall_beside(
+    records: Sequence[Record], model: FittedModel, excess: float, options: DiagnosisOptions = DEFAULT
+) -> float:
+    """Fall of -2 log evidence from which an effect is added to a model.
+
+    excess is what the recordings leave without effects.  Where loads left and right are computed all of what the model
+    leaves counts, not only a gap beyond noise: loads shake, wheels slip by it, and a false effect follows a good part
+    of that (a sixth of the excess in drives whose loads shake by 12 %).
+    """
+    left = model.excess if any(record.training.computes_sides for record in records) else None
+    of_gap = required_fall(temperature(excess, options), model.gap, model.checked_rows, model.rows, options, left)
+    return max(of_gap, options.max_formula_error**2 * (excess - model.excess))
 
 
 class FitCache:

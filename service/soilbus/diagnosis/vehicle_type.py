@@ -9,6 +9,10 @@ share of vehicles that have an effect of their own, and which, as the other vehi
 Bayes: Efron 2010, Large-Scale Inference, ch. 5; with a rule of succession, so that few vehicles teach little).
 Evidences are tempered as in `verdict`: a formula that is off is off in all vehicles.  A vehicle with a fault of its own
 may contradict the type's value, so vehicles that their own effects explain better are left out, while most remain.
+
+What the formula of the type's first effect leaves is alike in all vehicles too, so a further effect describes it, and
+vehicles are diagnosed beside that as well.  But its name is judged at the temperature of all recordings by what they
+leave without any effect: there V vehicles are no surer than one.
 """
 
 from __future__ import annotations
@@ -29,7 +33,8 @@ from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.options import TYPE_DEFAULT, TypeOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import joint_equations, normal_equations, scores
-from soilbus.diagnosis.verdict import temperature, temperature_of_all
+from soilbus.diagnosis.search import excess_without_effects
+from soilbus.diagnosis.verdict import TEMPERED_FALL_OF_NONE, temperature, temperature_of_all
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -58,6 +63,9 @@ class Factor:
         Fall of -2 log evidence by the effect, and by each that may be there in its place, by name.
     divisor
         What these are divided by (see `verdict`).
+    common_divisor
+        The same for what is alike in all vehicles: by what the model leaves without the type's effects, and without
+        bound, as a vehicle may have many logs.
     own
         Likelihood of the effect's parameters, those of the whole vehicle, about their neutral values in units of the
         catalogue's prior std.
@@ -65,6 +73,7 @@ class Factor:
 
     falls: Mapping[str, float]
     divisor: float
+    common_divisor: float
     own: OwnParameters
 
 
@@ -75,7 +84,7 @@ class SharedEffect:
     Attributes
     ----------
     effect, probability
-        The effect, and that the type has it.
+        The effect, and that the type has it; one that is less probable than not describes what the others leave.
     vehicles
         Indices of the vehicles that agree in its value.
     parameters
@@ -112,6 +121,9 @@ def factors_of(
         Effects that may be missing.
     """
     completed, law = found.completed, records[0].training.model.shear_law
+    alone = [replace(record, of_type=frozenset()) for record in records]
+    unbounded = replace(records[0].options, max_excess=math.inf)
+    common_divisor = temperature(excess_without_effects(alone, prior, found.base), unbounded)
     possible = {
         e.name: e for e in catalogue if not e.of_record and e.name not in found.base.names and e.base_law in (None, law)
     }
@@ -129,9 +141,11 @@ def factors_of(
                 fitted = fit_model(records, prior, beside, completed.as_starts(beside))
             own = None if fitted is None else _by_fit(records, prior, fitted, possible[name])
             if own is not None:
-                factors[name] = Factor(falls, addition.temperature, own)
+                factors[name] = Factor(falls, found.temperature, common_divisor, own)
     rest = [e for e in possible.values() if e.name not in factors and e.name not in completed.names]
-    return factors | _by_score(records, prior, completed, rest)
+    for name, (fall, own) in _by_score(records, prior, completed, rest).items():
+        factors[name] = Factor({name: fall}, found.temperature, common_divisor, own)
+    return factors
 
 
 def _by_fit(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect) -> OwnParameters | None:
@@ -146,7 +160,7 @@ def _by_fit(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, ef
     without = fit_model(records, prior, others, fitted.as_starts(others))
     if without is None:
         return None
-    own = _by_score(records, prior, without, [effect])[effect.name].own
+    _, own = _by_score(records, prior, without, [effect])[effect.name]
     at = {f.name: first.standardised(f.at(u)) for f, first, u in _effect_values(fitted)}
     return own._replace(information_vector=own.information @ [at[f.name] for f in own.free])
 
@@ -159,13 +173,13 @@ def _effect_values(fitted: FittedModel) -> Iterator[tuple[Free, Free, float]]:
 
 def _by_score(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, effects: Sequence[Effect]
-) -> dict[str, Factor]:
-    """By one linearisation where the effects are absent, which knows no range of the parameters."""
+) -> dict[str, tuple[float, OwnParameters]]:
+    """Falls and likelihoods by one linearisation where the effects are absent, which knows no range of parameters."""
     if not effects:
         return {}
     free = [f for effect in effects for f in parameters_of(effect, records[0].training.n_wheels)]
     joint = joint_equations(normal_equations(records, prior, present, effects, free))
-    factors = {}
+    found = {}
     for score in scores(records, prior, present, effects):
         effect = score.effect
         shared = [
@@ -173,15 +187,18 @@ def _by_score(
         ]
         information, vector = joint.information[np.ix_(shared, shared)], -joint.gradient[shared]
         own = OwnParameters(information, vector, tuple(free[i] for i in shared))
-        fall = -score.neg2_log_evidence
-        factors[effect.name] = Factor({effect.name: fall}, temperature(present.excess), own)
-    return factors
+        found[effect.name] = -score.neg2_log_evidence, own
+    return found
 
 
 def records_with(records: Sequence[Record], effect: Effect, free: Sequence[Free]) -> list[Record]:
     """The same recordings under a present model that has an effect of the type."""
+    of_type = records[0].of_type | {effect.name}
     return [
-        record.with_effects((*record.training.effects, effect), (*record.training.free, *free)) for record in records
+        replace(
+            record.with_effects((*record.training.effects, effect), (*record.training.free, *free)), of_type=of_type
+        )
+        for record in records
     ]
 
 
@@ -296,27 +313,34 @@ def _most_probable(
         return None
     best = max(found, key=lambda name: found[name][0])
     log_odds, pool, chosen = found[best]
-    p = _name_probability(best, [vehicles[v] for v in chosen]) * float(expit(log_odds))
-    return (best, pool, chosen, p) if p >= 0.5 else None
+    alike, agreeing = float(expit(log_odds)), [vehicles[v] for v in chosen]
+    places = [factors[best] for factors in agreeing]
+    if alike * _name_probability(best, agreeing, [place.divisor for place in places]) < 0.5:
+        return None
+    p = alike * _name_probability(best, agreeing, [place.common_divisor for place in places])
+    return best, pool, chosen, p
 
 
-def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
-    """Probability of a name among those in its place in the vehicles that agree.
+def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]], divisors: Sequence[float]) -> float:
+    """Probability of a name among those in its place in the vehicles that agree, and nothing (see `verdict`).
 
     At the temperature of all their recordings together, as a formula that is off is off in all of them.
     """
     places = [factors[best] for factors in vehicles]
-    divisor = temperature_of_all([place.divisor for place in places])
+    divisor = temperature_of_all(divisors)
     log_evidence: dict[str, float] = {}
     for name in sorted({rival for place in places for rival in place.falls}):
         here = [
-            {name: Factor(place.falls, divisor, factors[name].own)} if name in factors and name in place.falls else {}
+            {name: replace(factors[name], falls=place.falls, divisor=divisor)}
+            if name in factors and name in place.falls
+            else {}
             for factors, place in zip(vehicles, places, strict=True)
         ]
         pool = _pool(name, here) if any(here) else None
         if pool is not None and pool.free:
             log_evidence[name] = pool.of_all(range(len(vehicles)))
-    return float(softmax(list(log_evidence.values()))[list(log_evidence).index(best)])
+    of_all = [*log_evidence.values(), TEMPERED_FALL_OF_NONE / 2.0]
+    return float(softmax(of_all)[list(log_evidence).index(best)])
 
 
 def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:

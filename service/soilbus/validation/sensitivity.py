@@ -324,7 +324,7 @@ def factors_of_type(vehicles: int, share_of_own: float, value: float, std: float
         true = 0.15 * rng.normal() if rng.random() < share_of_own else value
         own = OwnParameters(information, information @ [(true + std * rng.normal()) / free[0].std], free)
         fall = -mixture_neg2_log_evidence(own.information, own.information_vector, free)
-        factors.append({GAIN.name: Factor({GAIN.name: fall}, temperature(0.0), own)})
+        factors.append({GAIN.name: Factor({GAIN.name: fall}, temperature(0.0), temperature(0.0), own)})
     return factors
 
 
