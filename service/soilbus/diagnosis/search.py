@@ -225,14 +225,13 @@ def excess_without_effects(records: Sequence[Record], prior: SoilPrior, present:
     What these explain counts as what a search explains: their formulas are not the field's either.  Not so those of
     the vehicle's type (Record.of_type).
     """
-    free, excess = present.free_unheld, present.excess
-    fitted = {f.effect for f in free if f.std > 0.0} - records[0].of_type
-    if fitted:
-        kept = [effect for effect in present.effects if effect.name not in fitted]
-        given = [f for f in free if f.effect not in fitted]
-        without = fit_model([record.with_effects(kept, given) for record in records], prior, kept)
-        excess = excess if without is None else max(excess, without.excess)
-    return excess
+    if not present.effects:
+        return present.excess
+    fitted = {f.effect for f in present.free_unheld if f.std > 0.0} - records[0].of_type
+    kept = [effect for effect in present.effects if effect.name not in fitted]
+    given = [f for f in present.free_unheld if f.effect not in fitted]
+    without = fit_model([record.with_effects(kept, given) for record in records], prior, kept) if fitted else None
+    return present.excess if without is None else max(present.excess, without.excess)
 
 
 def required_fall_beside(
@@ -240,13 +239,13 @@ def required_fall_beside(
 ) -> float:
     """Fall of -2 log evidence from which an effect is added to a model.
 
-    excess is what the recordings leave without effects.  Where loads left and right are computed all of what the model
+    excess: see excess_without_effects().  Where loads left and right are computed all of what the model
     leaves counts, not only a gap beyond noise: loads shake, wheels slip by it, and a false effect follows a good part
     of that (a sixth of the excess in drives whose loads shake by 12 %).
     """
     left = model.excess if any(record.training.computes_sides for record in records) else None
-    of_gap = required_fall(temperature(excess, options), model.gap, model.checked_rows, model.rows, options, left)
-    return max(of_gap, options.max_formula_error**2 * (excess - model.excess))
+    divisor, explained = temperature(excess, options), excess - model.excess
+    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options, left, explained)
 
 
 class FitCache:
