@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import islice
 
-import pytest
-
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.fleet import diagnose_type
@@ -34,7 +32,7 @@ def test_beside_a_large_effect_in_one_search():
 def test_beside_an_effect_of_the_configuration():
     """As `diagnose --model-out` writes it from one log, and a second log is diagnosed beside it."""
     hidden = fleet(33, {}, Fault("tyre_deflection:spring", 1.1e-6), vehicles=2, logs=2)
-    (first, second), _ = hidden.vehicles[1], None
+    first, second = hidden.vehicles[1]
     fitted = fit_model([first], PRIOR, [TYRE])
     assert fitted is not None
     values = fitted.parameters()[TYRE.name]
@@ -48,9 +46,9 @@ def test_beside_an_effect_of_the_configuration():
 
 
 def test_beside_an_effect_of_the_type():
-    hidden = fleet(33, {}, Fault("tyre_deflection:power", 0.007), vehicles=4, logs=1)
+    hidden = fleet(33, {}, Fault("tyre_deflection:power", 0.007), vehicles=3, logs=1)
     candidates = [TYRE, *(CATALOGUE[n] for n in ("rut_recovery", "drivetrain_loss", "lugs", "multipass"))]
     shared, _ = diagnose_type(hidden.vehicles, PRIOR, candidates)
     chances = {one.effect.name: one.probability for one in shared}
     assert chances.pop("tyre_deflection") > 0.5
-    assert max(chances.values(), default=0.0) == pytest.approx(0.0, abs=0.2)
+    assert max(chances.values(), default=0.0) < 0.2
