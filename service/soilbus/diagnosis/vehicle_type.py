@@ -10,9 +10,10 @@ Bayes: Efron 2010, Large-Scale Inference, ch. 5; with a rule of succession, so t
 Evidences are tempered as in `verdict`: a formula that is off is off in all vehicles.  A vehicle with a fault of its own
 may contradict the type's value, so vehicles that their own effects explain better are left out, while most remain.
 
-What the formula of the type's first effect leaves is alike in all vehicles too, so a further effect describes it, and
-vehicles are diagnosed beside that as well.  But its name is judged at the temperature of all recordings by what they
-leave without any effect: there V vehicles are no surer than one.
+What is alike in the vehicles goes into the model of each, as no fault of one.  What it is called is another question:
+what the formula of the type's first effect leaves is alike in all vehicles too, and looks like a further effect.  So
+names are judged at the temperature of all recordings by what they leave without effects: V vehicles are no surer there
+than one.
 """
 
 from __future__ import annotations
@@ -297,7 +298,7 @@ def shared_effect(
 def _most_probable(
     vehicles: Sequence[Mapping[str, Factor]], options: TypeOptions
 ) -> tuple[str, Pool, list[int], float] | None:
-    """Name, likelihoods, vehicles that agree, and probability; None where nothing is more probable than not."""
+    """Name, likelihoods, vehicles that agree, and probability; None where nothing is alike in most of them."""
     names = sorted(set.union(*(set(factors) for factors in vehicles)))
     found: dict[str, tuple[float, Pool, list[int]]] = {}
     for name in names:
@@ -313,21 +314,20 @@ def _most_probable(
         return None
     best = max(found, key=lambda name: found[name][0])
     log_odds, pool, chosen = found[best]
-    alike, agreeing = float(expit(log_odds)), [vehicles[v] for v in chosen]
-    places = [factors[best] for factors in agreeing]
-    if alike * _name_probability(best, agreeing, [place.divisor for place in places]) < 0.5:
+    if log_odds < 0.0:
         return None
-    p = alike * _name_probability(best, agreeing, [place.common_divisor for place in places])
+    p = float(expit(log_odds)) * _name_probability(best, [vehicles[v] for v in chosen])
     return best, pool, chosen, p
 
 
-def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]], divisors: Sequence[float]) -> float:
+def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
     """Probability of a name among those in its place in the vehicles that agree, and nothing (see `verdict`).
 
-    At the temperature of all their recordings together, as a formula that is off is off in all of them.
+    At the temperature of all their recordings together: a formula that is off is off in all of them, and leaves
+    something that is alike in all.
     """
     places = [factors[best] for factors in vehicles]
-    divisor = temperature_of_all(divisors)
+    divisor = temperature_of_all([place.common_divisor for place in places])
     log_evidence: dict[str, float] = {}
     for name in sorted({rival for place in places for rival in place.falls}):
         here = [
