@@ -61,8 +61,8 @@ class Diagnosis:
     rivals
         Where the verdict is ambiguous, the fitted models between which it is, the completed one first: they differ in
         the effect of the least probable name.
-    temperature
-        What differences of -2 log evidence are divided by.
+    excess
+        Of the squared residuals without effects (search.excess_without_effects): it gives the temperature.
     """
 
     verdict: Verdict
@@ -76,7 +76,7 @@ class Diagnosis:
     imitation: tuple[float, ...] = ()
     detectable: tuple[Detectable, ...] = ()
     rivals: tuple[FittedModel, ...] = ()
-    temperature: float = 1.0
+    excess: float = 0.0
 
     def soil_before(self, record: int) -> Posterior:
         """The soil of a recording under the present model."""
@@ -173,7 +173,7 @@ def diagnose(
         imitation,
         shown,
         rivals,
-        search.temperature,
+        search.excess,
     )
 
 

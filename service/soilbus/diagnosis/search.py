@@ -222,12 +222,12 @@ class Search:
 def excess_without_effects(records: Sequence[Record], prior: SoilPrior, present: FittedModel) -> float:
     """Excess of the squared residuals without those effects of the present model whose sizes are fitted.
 
-    What these explain counts as what a search explains: their formulas are not the field's either.  Not so those of
-    the vehicle's type (Record.of_type).
+    What these explain counts as what a search explains, whether a configuration or the type of the vehicle has put them
+    into the model: their formulas are not the field's either.
     """
     if not present.effects:
         return present.excess
-    fitted = {f.effect for f in present.free_unheld if f.std > 0.0} - records[0].of_type
+    fitted = {f.effect for f in present.free_unheld if f.std > 0.0}
     kept = [effect for effect in present.effects if effect.name not in fitted]
     given = [f for f in present.free_unheld if f.effect not in fitted]
     without = fit_model([record.with_effects(kept, given) for record in records], prior, kept) if fitted else None

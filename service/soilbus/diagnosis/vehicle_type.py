@@ -10,10 +10,9 @@ Bayes: Efron 2010, Large-Scale Inference, ch. 5; with a rule of succession, so t
 Evidences are tempered as in `verdict`: a formula that is off is off in all vehicles.  A vehicle with a fault of its own
 may contradict the type's value, so vehicles that their own effects explain better are left out, while most remain.
 
-What is alike in the vehicles goes into the model of each, as no fault of one.  What it is called is another question:
-what the formula of the type's first effect leaves is alike in all vehicles too, and looks like a further effect.  So
-names are judged at the temperature of all recordings by what they leave without effects: V vehicles are no surer there
-than one.
+What the formula of the type's first effect leaves is alike in all vehicles too, and looks like a further effect.  So a
+name is judged at the temperature of all recordings together by what they leave without effects: V vehicles are no surer
+there than one.
 """
 
 from __future__ import annotations
@@ -31,11 +30,10 @@ from soilbus.arrays import Array
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.evidence import OwnParameters, own_parameters
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
-from soilbus.diagnosis.options import TYPE_DEFAULT, TypeOptions
+from soilbus.diagnosis.options import DEFAULT, TYPE_DEFAULT, TypeOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import joint_equations, normal_equations, scores
-from soilbus.diagnosis.search import excess_without_effects
-from soilbus.diagnosis.verdict import TEMPERED_FALL_OF_NONE, temperature, temperature_of_all
+from soilbus.diagnosis.verdict import TEMPERED_FALL_OF_NONE, temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -50,6 +48,8 @@ __all__ = [
     "shared_effects",
 ]
 
+UNBOUNDED = replace(DEFAULT, max_excess=math.inf)
+"""For what is alike in many logs and vehicles: what a formula leaves of it grows with their number."""
 ROUNDING = float(np.finfo(float).eps)
 """Of a sum of probabilities, which are no surer than this."""
 
@@ -62,20 +62,21 @@ class Factor:
     ----------
     falls
         Fall of -2 log evidence by the effect, and by each that may be there in its place, by name.
-    divisor
-        What these are divided by (see `verdict`).
-    common_divisor
-        The same for what is alike in all vehicles: by what the model leaves without the type's effects, and without
-        bound, as a vehicle may have many logs.
+    excess
+        Of the squared residuals without effects, those of the type included: it gives the temperature (see `verdict`).
     own
         Likelihood of the effect's parameters, those of the whole vehicle, about their neutral values in units of the
         catalogue's prior std.
     """
 
     falls: Mapping[str, float]
-    divisor: float
-    common_divisor: float
+    excess: float
     own: OwnParameters
+
+    @property
+    def divisor(self) -> float:
+        """The temperature."""
+        return temperature(self.excess)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ class SharedEffect:
     Attributes
     ----------
     effect, probability
-        The effect, and that the type has it; one that is less probable than not describes what the others leave.
+        The effect, and that the type has it.
     vehicles
         Indices of the vehicles that agree in its value.
     parameters
@@ -122,9 +123,6 @@ def factors_of(
         Effects that may be missing.
     """
     completed, law = found.completed, records[0].training.model.shear_law
-    alone = [replace(record, of_type=frozenset()) for record in records]
-    unbounded = replace(records[0].options, max_excess=math.inf)
-    common_divisor = temperature(excess_without_effects(alone, prior, found.base), unbounded)
     possible = {
         e.name: e for e in catalogue if not e.of_record and e.name not in found.base.names and e.base_law in (None, law)
     }
@@ -142,10 +140,10 @@ def factors_of(
                 fitted = fit_model(records, prior, beside, completed.as_starts(beside))
             own = None if fitted is None else _by_fit(records, prior, fitted, possible[name])
             if own is not None:
-                factors[name] = Factor(falls, found.temperature, common_divisor, own)
+                factors[name] = Factor(falls, found.excess, own)
     rest = [e for e in possible.values() if e.name not in factors and e.name not in completed.names]
     for name, (fall, own) in _by_score(records, prior, completed, rest).items():
-        factors[name] = Factor({name: fall}, found.temperature, common_divisor, own)
+        factors[name] = Factor({name: fall}, found.excess, own)
     return factors
 
 
@@ -194,12 +192,8 @@ def _by_score(
 
 def records_with(records: Sequence[Record], effect: Effect, free: Sequence[Free]) -> list[Record]:
     """The same recordings under a present model that has an effect of the type."""
-    of_type = records[0].of_type | {effect.name}
     return [
-        replace(
-            record.with_effects((*record.training.effects, effect), (*record.training.free, *free)), of_type=of_type
-        )
-        for record in records
+        record.with_effects((*record.training.effects, effect), (*record.training.free, *free)) for record in records
     ]
 
 
@@ -298,7 +292,7 @@ def shared_effect(
 def _most_probable(
     vehicles: Sequence[Mapping[str, Factor]], options: TypeOptions
 ) -> tuple[str, Pool, list[int], float] | None:
-    """Name, likelihoods, vehicles that agree, and probability; None where nothing is alike in most of them."""
+    """Name, likelihoods, vehicles that agree, and probability; None where nothing is more probable than not."""
     names = sorted(set.union(*(set(factors) for factors in vehicles)))
     found: dict[str, tuple[float, Pool, list[int]]] = {}
     for name in names:
@@ -314,10 +308,8 @@ def _most_probable(
         return None
     best = max(found, key=lambda name: found[name][0])
     log_odds, pool, chosen = found[best]
-    if log_odds < 0.0:
-        return None
-    p = float(expit(log_odds)) * _name_probability(best, [vehicles[v] for v in chosen])
-    return best, pool, chosen, p
+    p = _name_probability(best, [vehicles[v] for v in chosen]) * float(expit(log_odds))
+    return (best, pool, chosen, p) if p >= 0.5 else None
 
 
 def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
@@ -327,33 +319,34 @@ def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> fl
     something that is alike in all.
     """
     places = [factors[best] for factors in vehicles]
-    divisor = temperature_of_all([place.common_divisor for place in places])
+    divisor = temperature(sum(abs(place.excess) for place in places), UNBOUNDED)
     log_evidence: dict[str, float] = {}
     for name in sorted({rival for place in places for rival in place.falls}):
         here = [
-            {name: replace(factors[name], falls=place.falls, divisor=divisor)}
-            if name in factors and name in place.falls
-            else {}
+            {name: replace(factors[name], falls=place.falls)} if name in factors and name in place.falls else {}
             for factors, place in zip(vehicles, places, strict=True)
         ]
-        pool = _pool(name, here) if any(here) else None
+        pool = _pool(name, here, divisor) if any(here) else None
         if pool is not None and pool.free:
             log_evidence[name] = pool.of_all(range(len(vehicles)))
     of_all = [*log_evidence.values(), TEMPERED_FALL_OF_NONE / 2.0]
     return float(softmax(of_all)[list(log_evidence).index(best)])
 
 
-def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
-    """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral."""
+def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]], of_all: float | None = None) -> Pool:
+    """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral.
+
+    of_all is what each is divided by, its own temperature where it is None.
+    """
     factors = {v: of_vehicle[name] for v, of_vehicle in enumerate(vehicles) if name in of_vehicle}
     common = set.intersection(*({f.name for f in factor.own.free} for factor in factors.values()))
     V, P = len(vehicles), len(common)
     information, vector, log_evidence = np.zeros((V, P, P)), np.zeros((V, P)), np.zeros(V)
     free: tuple[Free, ...] = ()
     for v, factor in factors.items():
-        own = _marginal(factor.own, common)
-        log_evidence[v] = (factor.falls[name] + own.neg2_log_evidence()) / factor.divisor / 2.0
-        information[v], vector[v] = own.information / factor.divisor, own.information_vector / factor.divisor
+        own, divisor = _marginal(factor.own, common), factor.divisor if of_all is None else of_all
+        log_evidence[v] = (factor.falls[name] + own.neg2_log_evidence()) / divisor / 2.0
+        information[v], vector[v] = own.information / divisor, own.information_vector / divisor
         free = own.free
     return Pool(information, vector, log_evidence, free)
 

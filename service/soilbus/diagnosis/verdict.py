@@ -85,11 +85,6 @@ def temperature(excess: float, options: DiagnosisOptions = DEFAULT) -> float:
     return (1.0 + min(abs(excess), options.max_excess) / options.alpha) / options.zeta_0
 
 
-def temperature_of_all(temperatures: Sequence[float], options: DiagnosisOptions = DEFAULT) -> float:
-    """T of recordings together, from that of each: their excesses add up."""
-    return sum(temperatures) - (len(temperatures) - 1) / options.zeta_0
-
-
 def required_fall(
     divisor: float,
     gap: float,
