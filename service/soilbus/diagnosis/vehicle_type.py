@@ -192,9 +192,11 @@ def _by_score(
 
 def records_with(records: Sequence[Record], effect: Effect, free: Sequence[Free]) -> list[Record]:
     """The same recordings under a present model that has an effect of the type."""
-    return [
+    of_type = records[0].of_type | {effect.name}
+    beside = [
         record.with_effects((*record.training.effects, effect), (*record.training.free, *free)) for record in records
     ]
+    return [replace(record, of_type=of_type) for record in beside]
 
 
 # --- the vehicles of a type
