@@ -70,10 +70,8 @@ def detectable(
 ) -> tuple[Detectable, ...]:
     """The detectable size of every candidate beside the present model fitted to these recordings."""
     options = records[0].options
-    divisor, excess = (
-        temperature_beside(records, prior, present, options),
-        excess_without_effects(records, prior, present),
-    )
+    divisor = temperature_beside(records, prior, present, options)
+    excess = excess_without_effects(records, prior, present)
     required = required_fall_beside(records, present, divisor, excess, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
