@@ -165,6 +165,12 @@ class Instrumentation:
             if np.array_equal(wheels["torque"][i], wheels["load"][k])
         )
 
+    @property
+    def without_speed(self) -> NDArray[np.bool_]:
+        """Which wheels (W,) have a speed that no channel measures, not even the mean of several."""
+        free = [row for row in self.speed if row.kind == "free"]
+        return np.array([any(row.weight[w] for row in free) for w in range(len(self.speed))])
+
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)
