@@ -111,3 +111,9 @@ def test_one_cell_for_two_wheels_is_named_where_the_model_does_not_fit(tmp_path)
     assert "load.FL is mapped for several wheels" in summary_of(of_shared, "a drive", None, Counter())
     assert {w.reason for w in of_alone} == {"none"}
     assert any("WheelLoads.FL" in line and "for that one alone" in line for line in configuration_warnings(shared))
+
+
+def test_a_draft_that_never_is_is_not_said_to_have_moved():
+    nothing = window("ambiguous", Status.NOT_EXCITED, excitation=Excitation(0.0, 0.0, 0.2, 0.05))
+    text = summary_of([nothing], "a drive", None, Counter())
+    assert "vary the load more: slip was 20.0 ± 5.0 %" in text
