@@ -226,10 +226,21 @@ def test_towing_what_is_never_towed_is_refused_in_one_line():
             drive(MACHINES["towing nothing"], on(**more), seed=1)
 
 
-def test_a_machine_that_tows_nothing_drives_up_a_slope_that_is_given(tmp_path):
+@pytest.fixture
+def never_towing(tmp_path):
+    """The configuration of the machine with axle motors, which tows nothing."""
     text = re.sub(r"\[signals\.draft\]\n(?:.+\n)+", "", (FOLDER / "tractor-axles.toml").read_text())
     (tmp_path / "c.toml").write_text(text.replace("[vehicle]", '[vehicle]\ntowing = "never"'))
-    command = ["simulate", "--config", str(tmp_path / "c.toml"), "--slope", "12", "--duration", "3"]
+    return str(tmp_path / "c.toml")
+
+
+def test_decisions_about_drafts_are_not_tried_where_nothing_is_towed(never_towing, capsys):
+    assert main(["decisions", "--config", never_towing]) == 2
+    assert "this vehicle never has" in capsys.readouterr().err
+
+
+def test_a_machine_that_tows_nothing_drives_up_a_slope_that_is_given(never_towing, tmp_path):
+    command = ["simulate", "--config", never_towing, "--slope", "12", "--duration", "3"]
     assert main([*command, "--log", str(tmp_path / "x.log"), "--truth", str(tmp_path / "x.csv")]) == 0
     with (tmp_path / "x.csv").open() as file:
         rows = list(csv.DictReader(file))
