@@ -112,6 +112,12 @@ def test_a_soil_that_is_nearly_right_is_asked_for(tmp_path, capsys):
     assert "no soil is named lome; did you mean loam?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("key", ["mass", "cg_ahead_of_rear_axle"])
+def test_a_deviation_that_is_given_twice_is_refused(key):
+    with pytest.raises(ConfigError, match=rf"{key} = {{ value, std }} and \w+_std are the same"):
+        load_config(machine("tractor-2wd"), [f"vehicle.{'cg' if key.startswith('cg') else key}_std=0.01"])
+
+
 def test_a_list_of_numbers_may_hold_whole_ones():
     assert load_config(FIELD, ["output.compaction=[50000, 100000, 2e5]"]).output.compaction == (5e4, 1e5, 2e5)
 

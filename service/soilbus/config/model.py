@@ -263,6 +263,8 @@ class Vehicle(_Section):
                 out |= {key: given["value"]} if "value" in given else {}
                 if "value" not in given:
                     del out[key]
+                if "std" in given and std in out:
+                    raise ValueError(f"{key} = {{ value, std }} and {std} are the same: leave out one of the two")
                 if "std" in given:
                     out[std] = given["std"]
         return out
