@@ -245,6 +245,14 @@ def test_a_draft_that_nothing_measures_is_said_to_leave_no_go(capsys, tmp_path):
     assert warnings(tmp_path / "c.toml", capsys, "vehicle.towing=never") == []
 
 
+@pytest.mark.parametrize("kind", ["kinematic", "specific_force"])
+def test_slopes_that_nothing_shows_are_said_to_count_as_drafts(kind, capsys, tmp_path):
+    text = machine("tractor-2wd").read_text().replace('pitch = "Attitude.Pitch"\n', "")
+    (tmp_path / "c.toml").write_text(text)
+    lines = warnings(tmp_path / "c.toml", capsys, f"signals.acceleration.kind={kind}")
+    assert ["the ground counts as level" in line for line in lines] == [True] * (kind == "kinematic")
+
+
 def test_the_settings_in_force_name_each_wheel_and_axle(capsys):
     assert main(["check", "--config", "tractor-2wd"]) == 0
     out = capsys.readouterr().out

@@ -392,6 +392,19 @@ def test_where_nothing_is_towed_slopes_take_the_pull_of_the_modelled_drive():
     assert pull == pytest.approx(rig.chassis.mass * GRAVITY * np.sin(truth["pitch"]), rel=0.02, abs=50.0)
 
 
+@pytest.mark.parametrize("felt", ["pitch", "specific force", "nothing"])
+def test_where_nothing_is_towed_the_balance_counts_only_where_a_sensor_shows_the_slope(felt):
+    rig = replace(rig_of(never_towing()), specific_force=felt == "specific force")
+    window = window_of(never_towing(), rig)
+    unknown = np.full(len(window.t), np.nan)
+    window = replace(window, pitch=np.zeros(len(window.t)) if felt == "pitch" else unknown)
+    window = completed(window if felt == "specific force" else replace(window, acceleration=unknown), rig)
+    weight = rig.chassis.mass * GRAVITY
+    assert np.all(window.draft == 0.0)
+    assert np.all(window.variance["draft"] == 0.0) == (felt != "nothing")
+    assert felt != "nothing" or np.all(window.variance["draft"] > (0.1 * weight) ** 2)
+
+
 def test_check_predicts_the_errors_of_a_machine_that_tows_nothing():
     (line,) = [line for line in load_lines(never_towing()) if "with load cells" in line]
     assert "varied slope" in line

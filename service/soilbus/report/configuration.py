@@ -100,6 +100,12 @@ def _lines_of_vehicle(config: Config) -> Iterator[str]:
         )
     if config.vehicle.towing == "unknown" and config.signals.draft is not None:
         yield 'vehicle.towing = "unknown", but signals.draft is mapped and counts: "measured" is meant'
+    felt = config.signals.acceleration
+    if config.signals.pitch is None and (felt is None or felt.kind == "kinematic"):
+        yield (
+            'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
+            " and each per cent of slope as a draft of one per cent of the weight"
+        )
     if config.vehicle.steering == "skid" and not (config.vehicle.track or config.signals.yaw_rate):
         yield (
             'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: how far the wheels slide'
