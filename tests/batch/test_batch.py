@@ -314,6 +314,7 @@ def test_a_lost_scheduler_is_one_line_and_leaves_what_is_done(in_process, config
     [
         (["--scheduler", "tcp://127.0.0.1:9"], 1, "tcp://127.0.0.1:9: no Dask scheduler there"),
         (["--scheduler", "nonsense"], 1, "nonsense: no Dask scheduler there"),
+        (["--scheduler", "tls://127.0.0.1:9"], 1, "tls://127.0.0.1:9: no Dask scheduler there"),
     ],
 )
 def test_a_scheduler_that_is_not_there_is_one_line(arguments, code, line, tractor, logs, tmp_path, capsys, monkeypatch):

@@ -34,7 +34,7 @@ def factor(value: float, std: float) -> Factor:
     information = np.array([[(prior / std) ** 2]])
     own = OwnParameters(information, information @ [value / prior], free)
     fall = value**2 / (std**2 + prior**2) * (prior / std) ** 2 - np.log1p((prior / std) ** 2)
-    return Factor({GAIN.name: float(fall)}, 6.0, own)
+    return Factor({GAIN.name: float(fall)}, 800.0, own)
 
 
 def shared(*vehicles: Factor) -> SharedEffect | None:

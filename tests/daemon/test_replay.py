@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import gzip
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -142,3 +144,22 @@ def test_a_frame_without_its_last_bytes_is_refused_in_other_formats_too(tmp_path
         found, error = outcome(read, path)
         assert len(found) == 4
         assert "cut off or damaged after 4 frames (a frame of 8 bytes has" in error
+
+
+def test_a_reader_that_cannot_be_made_prints_nothing_when_it_is_destroyed(tmp_path, monkeypatch):
+    class HalfMade:
+        def __init__(self, _: object) -> None:
+            self.itself = self  # so that only the collector destroys it
+            raise ValueError("no MDF file")
+
+        def __del__(self) -> None:
+            raise AttributeError("no file to close")
+
+    said: list[object] = []
+    monkeypatch.setattr("sys.unraisablehook", said.append)
+    monkeypatch.setattr("can.LogReader", HalfMade)
+    with pytest.raises(LogError, match="no MDF file"):
+        list(read_log(tmp_path / "drive.mf4"))
+    gc.collect()
+    assert said == []
+    assert sys.unraisablehook == said.append

@@ -7,13 +7,14 @@ import pytest
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import profile_over_n
 from soilbus.estimation.multistart import fit_window, refine
 from soilbus.estimation.observation_model import shrunk_latents
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation import local_optima
+from soilbus.validation import computed_loads, local_optima
 from soilbus.validation.cramer_rao import cramer_rao
 
 
@@ -51,3 +52,17 @@ def test_a_window_without_variation_is_no_more_certain_than_the_bound():
     fitted, denoised = np.sqrt(np.median(ratio, axis=0))
     assert denoised > 0.85
     assert fitted < 0.93 * denoised
+
+
+def test_a_free_wheel_adds_no_noise_to_a_window_that_is_denoised():
+    # The speed of a free wheel follows from the ground speed.  With a noise of its own it passes the ground speed's for
+    # a signal of three channels: tan phi moves by 0.9 sd (rms) where nothing but noise is taken out.
+    moved = []
+    for seed in range(6):
+        task = computed_loads.Task("tractor-2wd", "axle cells", "loam", 0.0, 300 + seed)
+        problem, prior = computed_loads.window_of(task)
+        fit = fit_window(problem, prior)
+        along = profile_over_n(problem, prior, Gaussian.of(prior, problem.gain_std), fit, has_nodes=False)
+        before, after = (one.mode.posterior.tan_phi() for one in (fit, along.top))
+        moved.append((after.value - before.value) / before.std)
+    assert np.sqrt(np.mean(np.square(moved))) < 0.4

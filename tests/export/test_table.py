@@ -46,6 +46,15 @@ def test_what_is_not_known_is_an_empty_cell_and_null(windows, config, tmp_path):
     assert row["soil.phi.value"] is row["slip.FL"] is row["chi2"] is row["traversability.probability"] is None
 
 
+def test_a_part_that_no_window_has_is_no_column(windows, config, tmp_path):
+    for name in ("w.csv", "w.parquet"):
+        write_table(tmp_path / name, windows[-1:], config)
+    columns = pq.read_schema(tmp_path / "w.parquet").names
+    assert columns == next(csv.reader((tmp_path / "w.csv").open(newline="")))
+    assert "soil" not in columns
+    assert {"chi2", "traversability.state"} <= set(columns)
+
+
 def test_parquet_has_types_units_and_versions(windows, config, lines, tmp_path):
     write_table(tmp_path / "w.parquet", windows, config)
     table = pq.read_table(tmp_path / "w.parquet")

@@ -361,24 +361,30 @@ def diagnose(args: argparse.Namespace) -> None:
 
 def batch(args: argparse.Namespace) -> None:
     """`soilbus batch`: many logs, on Dask."""
-    from soilbus.config.file import load_config
+    from soilbus.config.file import found_configuration, load_config
+
+    def own(path: Path) -> Config:
+        return load_config(found_configuration(str(path)), args.set)
 
     config = configured(args)
     for module in ("distributed", "pyarrow"):
         need_extra(module, "batch", "batch")
-    from soilbus.offline.batch import BatchError, check_new, cluster, jobs_of, run_batch
+    from soilbus.offline.batch import BatchError, check_out, cluster, jobs_of, results_in, run_batch
     from soilbus.report.batch import batch_text
     from soilbus.report.progress import phases
 
     check_folders(args.out)
-    if not (args.resume or args.retry):
-        check_new(args.out)
+    check_out(args.out, args.resume or args.retry)
     try:
-        jobs = jobs_of(config, Path(args.config).name, args.logs, lambda path: load_config(path, args.set))
-        with phases("batch") as progress, cluster(args.scheduler, say) as client:
+        parts = args.out / "parts" if args.resume or args.retry else None
+        jobs = jobs_of(config, Path(args.config or found_configuration(None)).name, args.logs, own, parts)
+        with phases("batch") as progress, cluster(args.scheduler, say) as client, results_in(args.out):
             done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose, args.retry)
     except BatchError as error:
         raise WorkError(str(error)) from None
+    except KeyboardInterrupt:
+        say("stopped; --resume goes on from here")
+        raise
     print(batch_text(done, args.out), end="")
     if not done.windows:
         raise WorkError(f"no log gave a window; each with its reason in {args.out / 'errors.parquet'}")

@@ -32,8 +32,7 @@ from soilbus.diagnosis.score import (
     normal_equations,
     shifted_effects,
 )
-from soilbus.diagnosis.search import required_fall_beside
-from soilbus.diagnosis.verdict import temperature
+from soilbus.diagnosis.search import excess_without_effects, required_fall_beside, temperature_beside
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
@@ -71,8 +70,9 @@ def detectable(
 ) -> tuple[Detectable, ...]:
     """The detectable size of every candidate beside the present model fitted to these recordings."""
     options = records[0].options
-    divisor = temperature(present.excess, options)
-    required = required_fall_beside(records, present, divisor, options)
+    divisor = temperature_beside(records, prior, present, options)
+    excess = excess_without_effects(records, prior, present)
+    required = required_fall_beside(records, present, divisor, excess, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
     for effects in _with_further_starts(candidates):

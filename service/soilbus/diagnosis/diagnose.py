@@ -61,6 +61,8 @@ class Diagnosis:
     rivals
         Where the verdict is ambiguous, the fitted models between which it is, the completed one first: they differ in
         the effect of the least probable name.
+    excess
+        Of the squared residuals without effects (search.excess_without_effects): it gives the temperature.
     """
 
     verdict: Verdict
@@ -74,6 +76,7 @@ class Diagnosis:
     imitation: tuple[float, ...] = ()
     detectable: tuple[Detectable, ...] = ()
     rivals: tuple[FittedModel, ...] = ()
+    excess: float = 0.0
 
     def soil_before(self, record: int) -> Posterior:
         """The soil of a recording under the present model."""
@@ -134,7 +137,8 @@ def diagnose(
     where, present = disagreements(base, options), base
     additions: list[Addition] = []
     progress("looking for effects")
-    for step in Search(full, thinned, base, candidates, options).steps():
+    search = Search(full, thinned, base, candidates, options)
+    for step in search.steps():
         additions, present = step
         progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
     if any(effect.late for effect in present.effects):
@@ -169,6 +173,7 @@ def diagnose(
         imitation,
         shown,
         rivals,
+        search.excess,
     )
 
 

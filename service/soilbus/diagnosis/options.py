@@ -55,6 +55,10 @@ class DiagnosisOptions:
     least_gap_share: float = 0.25
     """Share [1] of a real gap's excess over noise that an effect must explain to be added.  Without it 6 of 18 cases
     outside the catalogue (seeds 211 and 212) get names beside the verdict `unknown`, with it 2."""
+    max_formula_error: float = 0.1
+    """Share [1] of what effects change by which their formulas may be off: a further one must explain more than its
+    square of what they explain.  Where that is above 31 000 (seeds 301, 505, 506; 9 pairs, 2 singles) the smaller true
+    effect explains 1.25 % and more, false further ones 0.12 to 0.35 %."""
     named_probability: float = 0.8
     """Probability from which a name stands alone: the meaning of `named`."""
     set_probability: float = 0.02

@@ -47,6 +47,8 @@ class Record:
         Observation model of all instants, and the fold (N,) of each; None where no other fold can be held out.
     options
         Of its diagnosis.
+    of_type
+        Names of the model's effects that other vehicles share, and whose sizes these have determined.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Record:
     whole: ObservationModelWithEffects | None = None
     fold: NDArray[np.intp] | None = None
     options: DiagnosisOptions = DEFAULT
+    of_type: frozenset[str] = frozenset()
 
     def with_effects(
         self, effects: Sequence[Effect], free: Sequence[Free], joint_prior: Gaussian | None = None

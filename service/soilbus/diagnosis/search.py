@@ -76,8 +76,10 @@ class Search:
         Effects that may be missing.
     options
         Of the diagnosis.
+    excess
+        What the recordings leave without effects, see excess_without_effects().
     temperature
-        Of the recordings, by what the base leaves.
+        See temperature_beside().
     """
 
     full: FitCache
@@ -85,11 +87,14 @@ class Search:
     base: FittedModel
     candidates: Sequence[Effect]
     options: DiagnosisOptions = DEFAULT
+    excess: float = field(init=False)
     temperature: float = field(init=False)
     _compared: dict[frozenset[str], dict[str, FittedModel]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.temperature = temperature(self.base.excess, self.options)
+        given = self.full.records, self.full.prior, self.base
+        self.excess = excess_without_effects(*given)
+        self.temperature = temperature_beside(*given, self.options)
 
     def steps(self) -> Iterator[tuple[list[Addition], FittedModel]]:
         """After each addition and its swaps: the additions in the order of the model's effects, and the model."""
@@ -202,7 +207,7 @@ class Search:
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
         """Whether an effect explains less than the required fall."""
-        required = required_fall_beside(self.full.records, without, self.temperature, self.options)
+        required = required_fall_beside(self.full.records, without, self.temperature, self.excess, self.options)
         return without.neg2_log_evidence - model.neg2_log_evidence < required
 
     def _is_sampling_delay(self, without: FittedModel, model: FittedModel) -> bool:
@@ -215,17 +220,49 @@ class Search:
         )
 
 
+def excess_without_effects(
+    records: Sequence[Record], prior: SoilPrior, present: FittedModel, with_type: bool = False
+) -> float:
+    """Excess of the squared residuals without those effects of the present model whose sizes are fitted.
+
+    What these explain counts as what a search explains, whether a configuration or the type of the vehicle has put them
+    into the model: their formulas are not the field's either.  with_type: with those of the type.
+    """
+    if not present.effects:
+        return present.excess
+    fitted = {f.effect for f in present.free_unheld if f.std > 0.0}
+    fitted -= records[0].of_type if with_type else frozenset()
+    kept = [effect for effect in present.effects if effect.name not in fitted]
+    given = [f for f in present.free_unheld if f.effect not in fitted]
+    without = fit_model([record.with_effects(kept, given) for record in records], prior, kept) if fitted else None
+    return present.excess if without is None else max(present.excess, without.excess)
+
+
+def temperature_beside(
+    records: Sequence[Record], prior: SoilPrior, present: FittedModel, options: DiagnosisOptions = DEFAULT
+) -> float:
+    """The temperature of recordings under a model, by their excess without effects but for those of the type.
+
+    The other vehicles have determined these: what their formulas leave is alike in all, and no fault of one.
+    """
+    return temperature(excess_without_effects(records, prior, present, with_type=True), options)
+
+
 def required_fall_beside(
-    records: Sequence[Record], model: FittedModel, divisor: float, options: DiagnosisOptions = DEFAULT
+    records: Sequence[Record],
+    model: FittedModel,
+    divisor: float,
+    excess: float,
+    options: DiagnosisOptions = DEFAULT,
 ) -> float:
     """Fall of -2 log evidence from which an effect is added to a model, at a temperature.
 
-    Where loads left and right are computed all of the excess counts, not only a gap beyond noise: loads shake, wheels
-    slip by it, and a false effect follows a good part of that (a sixth of the excess in drives whose loads shake by
-    12 %).
+    excess: see excess_without_effects().  Where loads left and right are computed all of what the model
+    leaves counts, not only a gap beyond noise: loads shake, wheels slip by it, and a false effect follows a good part
+    of that (a sixth of the excess in drives whose loads shake by 12 %).
     """
-    excess = model.excess if any(record.training.computes_sides for record in records) else None
-    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options, excess)
+    left = model.excess if any(record.training.computes_sides for record in records) else None
+    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options, left, excess - model.excess)
 
 
 class FitCache:

@@ -9,6 +9,10 @@ share of vehicles that have an effect of their own, and which, as the other vehi
 Bayes: Efron 2010, Large-Scale Inference, ch. 5; with a rule of succession, so that few vehicles teach little).
 Evidences are tempered as in `verdict`: a formula that is off is off in all vehicles.  A vehicle with a fault of its own
 may contradict the type's value, so vehicles that their own effects explain better are left out, while most remain.
+
+What the formula of the type's first effect leaves is alike in all vehicles too, and looks like a further effect.  So a
+name is judged at the temperature of all recordings together by what they leave without effects: V vehicles are no surer
+there than one.
 """
 
 from __future__ import annotations
@@ -26,10 +30,10 @@ from soilbus.arrays import Array
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.evidence import OwnParameters, own_parameters
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
-from soilbus.diagnosis.options import TYPE_DEFAULT, TypeOptions
+from soilbus.diagnosis.options import DEFAULT, TYPE_DEFAULT, TypeOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import joint_equations, normal_equations, scores
-from soilbus.diagnosis.verdict import temperature, temperature_of_all
+from soilbus.diagnosis.verdict import TEMPERED_FALL_OF_NONE, temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -44,6 +48,8 @@ __all__ = [
     "shared_effects",
 ]
 
+UNBOUNDED = replace(DEFAULT, max_excess=math.inf)
+"""For what is alike in many logs and vehicles: what a formula leaves of it grows with their number."""
 ROUNDING = float(np.finfo(float).eps)
 """Of a sum of probabilities, which are no surer than this."""
 
@@ -56,16 +62,21 @@ class Factor:
     ----------
     falls
         Fall of -2 log evidence by the effect, and by each that may be there in its place, by name.
-    divisor
-        What these are divided by (see `verdict`).
+    excess
+        Of the squared residuals without effects, those of the type included: it gives the temperature (see `verdict`).
     own
         Likelihood of the effect's parameters, those of the whole vehicle, about their neutral values in units of the
         catalogue's prior std.
     """
 
     falls: Mapping[str, float]
-    divisor: float
+    excess: float
     own: OwnParameters
+
+    @property
+    def divisor(self) -> float:
+        """The temperature."""
+        return temperature(self.excess)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +140,11 @@ def factors_of(
                 fitted = fit_model(records, prior, beside, completed.as_starts(beside))
             own = None if fitted is None else _by_fit(records, prior, fitted, possible[name])
             if own is not None:
-                factors[name] = Factor(falls, addition.temperature, own)
+                factors[name] = Factor(falls, found.excess, own)
     rest = [e for e in possible.values() if e.name not in factors and e.name not in completed.names]
-    return factors | _by_score(records, prior, completed, rest)
+    for name, (fall, own) in _by_score(records, prior, completed, rest).items():
+        factors[name] = Factor({name: fall}, found.excess, own)
+    return factors
 
 
 def _by_fit(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect) -> OwnParameters | None:
@@ -146,7 +159,7 @@ def _by_fit(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, ef
     without = fit_model(records, prior, others, fitted.as_starts(others))
     if without is None:
         return None
-    own = _by_score(records, prior, without, [effect])[effect.name].own
+    _, own = _by_score(records, prior, without, [effect])[effect.name]
     at = {f.name: first.standardised(f.at(u)) for f, first, u in _effect_values(fitted)}
     return own._replace(information_vector=own.information @ [at[f.name] for f in own.free])
 
@@ -159,13 +172,13 @@ def _effect_values(fitted: FittedModel) -> Iterator[tuple[Free, Free, float]]:
 
 def _by_score(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, effects: Sequence[Effect]
-) -> dict[str, Factor]:
-    """By one linearisation where the effects are absent, which knows no range of the parameters."""
+) -> dict[str, tuple[float, OwnParameters]]:
+    """Falls and likelihoods by one linearisation where the effects are absent, which knows no range of parameters."""
     if not effects:
         return {}
     free = [f for effect in effects for f in parameters_of(effect, records[0].training.n_wheels)]
     joint = joint_equations(normal_equations(records, prior, present, effects, free))
-    factors = {}
+    found = {}
     for score in scores(records, prior, present, effects):
         effect = score.effect
         shared = [
@@ -173,16 +186,17 @@ def _by_score(
         ]
         information, vector = joint.information[np.ix_(shared, shared)], -joint.gradient[shared]
         own = OwnParameters(information, vector, tuple(free[i] for i in shared))
-        fall = -score.neg2_log_evidence
-        factors[effect.name] = Factor({effect.name: fall}, temperature(present.excess), own)
-    return factors
+        found[effect.name] = -score.neg2_log_evidence, own
+    return found
 
 
 def records_with(records: Sequence[Record], effect: Effect, free: Sequence[Free]) -> list[Record]:
     """The same recordings under a present model that has an effect of the type."""
-    return [
+    of_type = records[0].of_type | {effect.name}
+    beside = [
         record.with_effects((*record.training.effects, effect), (*record.training.free, *free)) for record in records
     ]
+    return [replace(record, of_type=of_type) for record in beside]
 
 
 # --- the vehicles of a type
@@ -301,35 +315,40 @@ def _most_probable(
 
 
 def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
-    """Probability of a name among those in its place in the vehicles that agree.
+    """Probability of a name among those in its place in the vehicles that agree, and nothing (see `verdict`).
 
-    At the temperature of all their recordings together, as a formula that is off is off in all of them.
+    At the temperature of all their recordings together: a formula that is off is off in all of them, and leaves
+    something that is alike in all.
     """
     places = [factors[best] for factors in vehicles]
-    divisor = temperature_of_all([place.divisor for place in places])
+    divisor = temperature(sum(abs(place.excess) for place in places), UNBOUNDED)
     log_evidence: dict[str, float] = {}
     for name in sorted({rival for place in places for rival in place.falls}):
         here = [
-            {name: Factor(place.falls, divisor, factors[name].own)} if name in factors and name in place.falls else {}
+            {name: replace(factors[name], falls=place.falls)} if name in factors and name in place.falls else {}
             for factors, place in zip(vehicles, places, strict=True)
         ]
-        pool = _pool(name, here) if any(here) else None
+        pool = _pool(name, here, divisor) if any(here) else None
         if pool is not None and pool.free:
             log_evidence[name] = pool.of_all(range(len(vehicles)))
-    return float(softmax(list(log_evidence.values()))[list(log_evidence).index(best)])
+    of_all = [*log_evidence.values(), TEMPERED_FALL_OF_NONE / 2.0]
+    return float(softmax(of_all)[list(log_evidence).index(best)])
 
 
-def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
-    """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral."""
+def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]], of_all: float | None = None) -> Pool:
+    """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral.
+
+    of_all is what each is divided by, its own temperature where it is None.
+    """
     factors = {v: of_vehicle[name] for v, of_vehicle in enumerate(vehicles) if name in of_vehicle}
     common = set.intersection(*({f.name for f in factor.own.free} for factor in factors.values()))
     V, P = len(vehicles), len(common)
     information, vector, log_evidence = np.zeros((V, P, P)), np.zeros((V, P)), np.zeros(V)
     free: tuple[Free, ...] = ()
     for v, factor in factors.items():
-        own = _marginal(factor.own, common)
-        log_evidence[v] = (factor.falls[name] + own.neg2_log_evidence()) / factor.divisor / 2.0
-        information[v], vector[v] = own.information / factor.divisor, own.information_vector / factor.divisor
+        own, divisor = _marginal(factor.own, common), factor.divisor if of_all is None else of_all
+        log_evidence[v] = (factor.falls[name] + own.neg2_log_evidence()) / divisor / 2.0
+        information[v], vector[v] = own.information / divisor, own.information_vector / divisor
         free = own.free
     return Pool(information, vector, log_evidence, free)
 

@@ -1,14 +1,15 @@
 """From evidences to a verdict: none, named, ambiguous or unknown, with probabilities.
 
     P(name) = exp(zeta fall / 2) / (K + sum over names of exp(zeta fall / 2)),  fall = -2 log evidence before - after
-    zeta = zeta_0 alpha / (alpha + E) = 1 / T,  E = |chi2 - rows| of the present model;  K: effects of the catalogue
+    zeta = zeta_0 alpha / (alpha + E) = 1 / T,  E = |chi2 - rows| without effects;  K: effects of the catalogue
 
 No effect's formula is exactly that of the field: one that is off by a share e of its effect leaves e^2 E unexplained,
 however long the recording.  So the likelihood counts to the power zeta, as if the data were to follow some model to
 within a relative entropy in proportion to E only (coarsened posterior: Miller & Dunson 2019, J. Am. Stat. Assoc.
 114:1113).  Where nothing is missing zeta is zeta_0, as residuals that follow each other are not independent.
 A priori nothing is missing with probability 1/2, and every effect with 1 / 2 K.  An effect is added where it is more
-probable than none and explains a good part of the gap; the verdict is `unknown` where too much of the gap remains.
+probable than none, and explains a good part of the gap and more than the formulas of the others may leave; the verdict
+is `unknown` where too much of the gap remains.
 """
 
 from __future__ import annotations
@@ -84,11 +85,6 @@ def temperature(excess: float, options: DiagnosisOptions = DEFAULT) -> float:
     return (1.0 + min(abs(excess), options.max_excess) / options.alpha) / options.zeta_0
 
 
-def temperature_of_all(temperatures: Sequence[float], options: DiagnosisOptions = DEFAULT) -> float:
-    """T of recordings together, from that of each: their excesses add up."""
-    return sum(temperatures) - (len(temperatures) - 1) / options.zeta_0
-
-
 def required_fall(
     divisor: float,
     gap: float,
@@ -96,6 +92,7 @@ def required_fall(
     rows: int,
     options: DiagnosisOptions = DEFAULT,
     excess: float | None = None,
+    explained: float = 0.0,
 ) -> float:
     """Fall of -2 log evidence from which an effect is added.
 
@@ -109,10 +106,13 @@ def required_fall(
         Residuals of all blocks.
     excess
         Of all blocks' chi-square over the expected one, where all of it counts; else that of a gap beyond noise.
+    explained
+        What the effects of the present model take from that excess: their formulas leave a share of it.
     """
     if excess is None:
         excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows, options) else 0.0
-    return max(least_required_fall(divisor), options.least_gap_share * excess)
+    of_formulas = options.max_formula_error**2 * explained
+    return max(least_required_fall(divisor), options.least_gap_share * excess, of_formulas)
 
 
 def least_required_fall(divisor: float) -> float:

@@ -40,7 +40,6 @@ from soilbus.estimation.options import PosteriorOptions
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, coordinates_of
-from soilbus.terra.wheel import Soil
 
 _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
@@ -316,8 +315,8 @@ def _node(
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
     objective = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
-    latents = problem.with_entry_angles(near.optimum.latents, Soil(*soil.tolist()), gains)
-    fit = refine(objective, Iterate(soil, gains, latents))
+    last = near.optimum
+    fit = refine(objective, objective.moved(Iterate(last.soil, last.gains, last.latents), last.at, soil, gains))
     if fit is None or not fit.converged:
         return None
     return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)

@@ -158,7 +158,8 @@ class Measurements:
         else:
             value, variance = window.observations.value[kept], window.observations.variance[kept]
             known = np.isfinite(value) & np.isfinite(variance)
-            self._measured, self._measured_var = np.where(known, value, 1.0), np.where(known, variance, 0.0)
+            self._measured = np.where(known, value, 1.0)
+            self._measured_var = np.where(known & ~self._of_free_wheels(), variance, 0.0)
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
         known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
@@ -229,6 +230,13 @@ class Measurements:
             self._prior_only &= ~self._by_torques
             self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
+
+    def _of_free_wheels(self) -> NDArray[np.bool_]:
+        """Observations (2 W + 1,) of the speeds of free wheels alone, which follow from the ground speed."""
+        assert self._latent_matrix is not None
+        others = np.ones(len(self._prior_only), bool)
+        others[len(self.rolls) : -1] = ~self.rolls
+        return np.asarray(~self._latent_matrix[:, others].any(axis=1))
 
     def observed(self, latents: Array) -> Array:
         """Observations (N, 2 W + 1) that latents (N, 2 W + 1) of the wheels would give without noise and gain error."""

@@ -219,18 +219,21 @@ class Objective:
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: QuadraticModel, step: Array) -> Iterate:
-        """The iterate after a step (F + A,), shortened at bounds, with latents as the linear model predicts them.
-
-        Entry angles that change far are solved.
-        """
+        """The iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
         free = len(self.free)
         step = self.step_fraction(iterate, step) * step
         soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), iterate.gains.copy()
         gains[self.active] += step[free:]
         if self._has_gain_bounds:
             gains = self.problem.allowed(gains)
-        changes = soil - iterate.soil, gains - iterate.gains
-        at, latents = model.linearisation, iterate.latents
+        return self.moved(iterate, model.linearisation, soil, gains)
+
+    def moved(self, iterate: Iterate, at: Linearisation, soil: Array, gains: Array) -> Iterate:
+        """The iterate of another soil (6,) and gains (G,), with latents as the linear model at this one predicts them.
+
+        Entry angles that change far are solved.
+        """
+        changes, latents = (soil - iterate.soil, gains - iterate.gains), iterate.latents
         if self.as_measured:
             angle = self.problem.stepped_entry_angle(at, latents.entry_angle, *changes)
             new = latents._replace(entry_angle=angle)

@@ -12,7 +12,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from typing import Literal, NamedTuple
 
-__all__ = ["SCHEMA_VERSION", "Column", "column"]
+__all__ = ["SCHEMA_VERSION", "Column", "column", "is_part"]
 
 SCHEMA_VERSION = "1"
 """Version of the records' keys, kinds and units; a reader of another one must not assume this table."""
@@ -114,3 +114,9 @@ _COLUMNS: tuple[tuple[str, Column], ...] = (
 def column(key: str) -> Column | None:
     """Kind and unit of a key; None where it is no key of a record."""
     return next((found for pattern, found in _COLUMNS if fnmatchcase(key, pattern)), None)
+
+
+@cache
+def is_part(key: str) -> bool:
+    """Whether a key is that of a part, with values below it, as `soil`, which is null in an invalid window."""
+    return column(key) is None and any(pattern.startswith(f"{key}.") for pattern, _ in _COLUMNS)

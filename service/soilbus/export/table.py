@@ -15,7 +15,7 @@ from typing import Any
 
 from soilbus import __version__
 from soilbus.config.model import Config
-from soilbus.export.columns import SCHEMA_VERSION, Kind, column
+from soilbus.export.columns import SCHEMA_VERSION, Kind, column, is_part
 from soilbus.files import whole_file, whole_file_of_bytes
 from soilbus.pipeline.outputs import column_names, flat_record, window_record
 from soilbus.pipeline.result import WindowResult
@@ -42,7 +42,7 @@ def write_table(path: Path, results: Iterable[WindowResult], config: Config) -> 
 
 def write_csv(out: Any, rows: Rows) -> None:
     """Write rows with a head of column names; what is not known is an empty cell."""
-    writer = csv.DictWriter(out, column_names(rows), extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(out, table_columns(rows), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
 
@@ -52,8 +52,13 @@ def parquet_of(rows: Rows) -> bytes:
     import pyarrow.parquet as pq
 
     out = io.BytesIO()
-    pq.write_table(arrow_table(rows, arrow_schema(column_names(rows))), out)
+    pq.write_table(arrow_table(rows, arrow_schema(table_columns(rows))), out)
     return out.getvalue()
+
+
+def table_columns(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Columns of a table of these rows; a part that is null as a whole in all of them is none."""
+    return [name for name in column_names(rows) if not is_part(name)]
 
 
 def arrow_schema(names: Iterable[str]) -> Any:

@@ -11,19 +11,18 @@ it is sent along.
 
 from __future__ import annotations
 
-import csv
-import glob
+import fcntl
 import hashlib
 import json
 import logging
 import math
+import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -32,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from soilbus import __version__
-from soilbus.config.model import Config, ConfigError
+from soilbus.config.model import ConfigError
 from soilbus.offline import dataset
 from soilbus.offline.fleet import (
     Given,
@@ -43,15 +42,19 @@ from soilbus.offline.fleet import (
     judged,
     no_findings,
 )
-from soilbus.offline.parts import Job, OtherVersion, Outcome, Setup, part_of, setup_of, summary_of_part
+from soilbus.offline.jobs import BatchError, jobs_of
+from soilbus.offline.parts import (
+    Job,
+    OtherVersion,
+    Outcome,
+    part_of,
+    summary_of_part,
+)
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
-__all__ = ["Batch", "BatchError", "check_new", "cluster", "jobs_of", "run_batch"]
+__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch"]
 
-LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
-"""Of logs that python-can reads; each may have .gz behind it."""
-TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
 TASKS_PER_THREAD = 3
@@ -65,10 +68,6 @@ STATES_AT_ONCE = 32
 """Files that are asked for their state at once: of 80 000 logs on a server that answers in 50 ms in two minutes."""
 MAX_SENT_BYTES = 256 * 2**20
 """Bytes of a log that is sent along; it is in memory on its way."""
-
-
-class BatchError(Exception):
-    """The batch cannot be done, or not to its end; the text is one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,141 +101,6 @@ class Batch:
     duration: float
 
 
-# --- from what the user names to jobs
-
-
-def jobs_of(config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config]) -> list[Job]:
-    """The jobs that the arguments of the command stand for, in the order of vehicle and log.
-
-    Parameters
-    ----------
-    config, name
-        The configuration for logs that have none of their own, and its file's name.
-    logs
-        Logs, folders, globs, URLs, or manifests: tables (CSV, Parquet) with a column `log`, and optionally `vehicle`,
-        `configuration` and `start` (ISO 8601, or seconds since 1970).
-    load
-        Reads another configuration.
-
-    Returns
-    -------
-    One job for each log.  Where no manifest names the vehicle, it is that of the folder in which the log lies.
-
-    Raises
-    ------
-    ConfigError
-        A configuration is wrong.
-    BatchError
-        There is no log, or a manifest cannot be read.
-    """
-    setups: dict[Path | None, Setup] = {}
-
-    def setup(path: Path | None) -> Setup:
-        if path not in setups:
-            setups[path] = setup_of(config, name) if path is None else setup_of(load(path), path.name)
-        return setups[path]
-
-    suffixes = TABLE_SUFFIXES if config.table is not None else LOG_SUFFIXES
-    setup(None)
-    jobs: dict[str, Job] = {}
-    for argument in logs:
-        for entry in _entries(argument):
-            found = _files(entry["log"], suffixes)
-            if not found:
-                raise BatchError(f"{entry['log']}: no log there")
-            for log in found:
-                vehicle = entry.get("vehicle") or log.rpartition("/")[0].rpartition("/")[2] or "unknown"
-                own = entry.get("configuration")
-                job = Job(log, vehicle, setup(Path(own) if own else None), _start(entry.get("start"), argument))
-                jobs[job.digest] = job
-    return sorted(jobs.values(), key=lambda job: (job.vehicle, job.log, job.digest))
-
-
-def _entries(argument: str) -> list[dict[str, str]]:
-    """Rows of a manifest, or one row that names the argument itself."""
-    path = Path(argument)
-    if path.suffix not in (".csv", ".parquet") or not path.is_file():
-        return [{"log": argument}]
-    try:
-        if path.suffix == ".csv":
-            with path.open(newline="", encoding="utf-8-sig") as text:
-                table = csv.DictReader(text)
-                rows = [dict(row) for row in table] if "log" in (table.fieldnames or ()) else []
-        else:
-            rows = _parquet_rows(path)
-    except (OSError, ValueError, csv.Error) as error:
-        raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
-    if not rows:
-        return [{"log": argument}]
-    return [_entry(path, row) for row in rows]
-
-
-def _entry(manifest: Path, row: Mapping[str, Any]) -> dict[str, str]:
-    """A row's texts; paths in it begin at the manifest's folder."""
-    texts = {name: str(value).strip() for name, value in row.items() if value is not None}
-    if not texts.get("log"):
-        raise BatchError(f"{manifest}: a row without a log")
-    for name in ("log", "configuration"):
-        if texts.get(name) and "://" not in texts[name]:
-            texts[name] = str(manifest.parent / texts[name])
-    return texts
-
-
-def _parquet_rows(path: Path) -> list[dict[str, Any]]:
-    import pyarrow.parquet as pq
-
-    names = pq.read_schema(path).names
-    wanted = [name for name in ("log", "vehicle", "configuration", "start") if name in names]
-    rows: list[dict[str, Any]] = pq.read_table(path, columns=wanted).to_pylist() if "log" in names else []
-    return rows
-
-
-def _start(text: str | None, manifest: str) -> float | None:
-    if not text:
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        when = datetime.fromisoformat(text)
-    except ValueError:
-        raise BatchError(f"{manifest}: start {text} is neither ISO 8601 nor seconds since 1970") from None
-    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-
-
-def _files(log: str, suffixes: Sequence[str]) -> list[str]:
-    """The logs that a path, a folder, a glob or a URL stands for; of a folder all below it that can be logs."""
-    if "://" in log:
-        return _remote_files(log, suffixes)
-    path = Path(log)
-    if path.is_dir():
-        return sorted(str(each.resolve()) for each in path.rglob("*") if _is_log(each.name, suffixes))
-    if glob.has_magic(log) and not path.exists():
-        return sorted(str(Path(each).resolve()) for each in glob.glob(log, recursive=True) if Path(each).is_file())
-    return [str(path.resolve())]
-
-
-def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
-    from fsspec.core import url_to_fs
-
-    try:
-        files, name = url_to_fs(url)
-        if glob.has_magic(name):
-            return sorted(str(files.unstrip_protocol(each)) for each in files.glob(name))
-        # over HTTP a file that is asked whether it is a folder is read as a page of links
-        if not _is_log(name, suffixes) and files.isdir(name):
-            found = [each for each in files.find(name) if _is_log(each, suffixes)]
-            return sorted(str(files.unstrip_protocol(each)) for each in found)
-    except Exception as error:  # each protocol has its own
-        raise BatchError(f"{url}: {one_line(error, 150)}") from None
-    return [url]
-
-
-def _is_log(name: str, suffixes: Sequence[str]) -> bool:
-    return Path(name.lower().removesuffix(".gz")).suffix in suffixes
-
-
 # --- Dask
 
 
@@ -261,7 +125,9 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
     dask: Any = import_module("dask")
     distributed: Any = import_module("distributed")  # typed only in part
     # Dask speaks of every worker that is lost; what it means for a log we say ourselves
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in list(logging.root.manager.loggerDict):  # Dask sets a level for some of them
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     settings = {
         "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
         "distributed.client.scheduler-info-interval": 2000,
@@ -282,7 +148,7 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
         try:
             with warnings.catch_warnings(category=distributed.versions.VersionMismatchWarning, action="ignore"):
                 client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
-        except (OSError, TimeoutError, ValueError) as error:
+        except (OSError, TimeoutError, TypeError, ValueError) as error:  # TypeError: TLS without a certificate
             raise BatchError(f"{address}: no Dask scheduler there ({one_line(error, 100)})") from None
         with client:
             _check_workers(client, address)
@@ -366,10 +232,34 @@ def done_in_turn(
 # --- the batch
 
 
-def check_new(out: Path) -> None:
-    """Raises ConfigError where a folder holds parts of an earlier run."""
-    if any((out / "parts").glob("*")):
+def check_out(out: Path, resume: bool) -> None:
+    """Raises ConfigError where a folder holds results and no run is resumed, or other files that would be replaced."""
+    if not resume and any((out / "parts").glob("*")):
         raise ConfigError([f"--out {out}: it holds results: go on with --resume, or take another folder"])
+    if out.exists() and not out.is_dir():
+        raise ConfigError([f"--out {out}: a file, no folder"])
+    taken = [name for name in dataset.RESULTS if (out / name).exists()]
+    if taken and not (resume and (out / "parts").is_dir()):
+        what = f"it has no parts of a batch, but {taken[0]}, which would be replaced: take another folder"
+        raise ConfigError([f"--out {out}: {what}"])
+
+
+@contextmanager
+def results_in(out: Path) -> Iterator[None]:
+    """A folder for results that no other process writes to meanwhile; BatchError where one does, OSError."""
+    (out / "parts").mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(out, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise BatchError(f"{out}: another soilbus batch writes its results there") from None
+    except OSError:  # a network's file system without locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def run_batch(
@@ -429,6 +319,8 @@ def run_batch(
     dataset.write_rows(out / "errors.parquet", errors, dataset.ERROR_COLUMNS)
     if logs:
         dataset.write_rows(out / "logs.parquet", logs)
+    else:
+        (out / "logs.parquet").unlink(missing_ok=True)
     dataset.write_rows(out / "vehicles.parquet", vehicles)
     return Batch(
         vehicles,
@@ -585,14 +477,17 @@ def _write_windows(
 ) -> None:
     """The parts as tables by vehicle and day, and the map of them."""
     new, windows, vehicles = out / ".windows", out / "windows", {job.digest: job.vehicle for job in jobs}
-    if not summaries:
-        return
     shutil.rmtree(new, ignore_errors=True)  # of a run that was stopped
+    if not summaries:
+        shutil.rmtree(windows, ignore_errors=True)
+        (out / "map.parquet").unlink(missing_ok=True)
+        return
     columns = dataset.window_columns(summaries.values())
     tasks = ((digest, (_part_path(out / "parts", digest).read_bytes(), columns)) for digest in summaries)
     for n, (digest, files) in enumerate(done_in_turn(client, dataset.day_files, tasks), 1):
         if isinstance(files, BaseException):
-            raise BatchError(f"the part {digest} cannot be converted ({one_line(Exception(str(files)), 100)})")
+            part, why = _part_path(out / "parts", digest), one_line(Exception(str(files)), 100)
+            raise BatchError(f"{part}: cannot be converted ({why}): delete it, and --resume reads its log again")
         for day, content in files.items():
             dataset.put(dataset.folder_of(new, vehicles[digest], day) / f"{digest}.parquet", content)
         progress(f"tables of {n} of {len(summaries)} logs")

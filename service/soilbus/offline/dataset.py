@@ -21,21 +21,29 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from soilbus.export.table import arrow_schema, arrow_table
+from soilbus.export.table import arrow_schema, arrow_table, table_columns
 from soilbus.files import whole_file_of_bytes
 from soilbus.offline.parts import rows_of_part
 from soilbus.pipeline.outputs import column_names
 
 ROW_GROUP = 2000
 """Rows that are converted at once: 2 MB of columns."""
+HIVE_NULL = "__HIVE_DEFAULT_PARTITION__"
+"""Name of a folder for what has no value; pandas cannot read it beside others."""
 NO_DAY = "unknown"
-"""Day of windows whose log has no dates; Hive's name for null is not taken, as pandas cannot read it beside others."""
+"""Day of windows whose log has no dates."""
+LONGEST_NAME = 255
+"""Bytes of a file's name on usual file systems."""
 MAP_COLUMNS = (
     "vehicle", "log", "window", "t", "time", "status", "reason", "bearing_pressure.value", "bearing_pressure.std",
     "soil.phi.value", "soil.phi.std", "traversability.state", "traversability.probability",
     "traversability.max_draft.value", "traversability.max_draft.std", "traversability.limit",
 )  # fmt: skip
 """Columns of the windows that the map repeats."""
+RESULTS = (
+    "windows", "logs.parquet", "vehicles.parquet", "errors.parquet", "map.parquet", "diagnosis.json", "effects.parquet",
+)  # fmt: skip
+"""In a folder of results, what each run writes again."""
 ERROR_COLUMNS = ("vehicle", "log", "windows", "fault")
 EFFECT_COLUMNS = (
     "configuration", "vehicle", "effect", "scope", "parameter", "value", "std", "probability", "named", "since",
@@ -82,12 +90,21 @@ def _day(milliseconds: int | None) -> str:
 
 def window_columns(summaries: Iterable[Mapping[str, Any]]) -> list[str]:
     """Columns of all windows: those of every part; the vehicle is in the folder's name."""
-    return [c for c in column_names(dict.fromkeys(s["columns"]) for s in summaries) if c != "vehicle"]
+    return [c for c in table_columns(dict.fromkeys(s["columns"]) for s in summaries) if c != "vehicle"]
 
 
 def folder_of(windows: Path, vehicle: str, day: str) -> Path:
     """Folder of a vehicle's windows of one day."""
-    return windows / f"vehicle={quote(vehicle, safe=' ')}" / f"day={day}"
+    return windows / _vehicle_folder(vehicle) / f"day={day}"
+
+
+def can_be_folder(vehicle: str) -> bool:
+    """Whether a folder can have the name of a vehicle, and readers find it."""
+    return vehicle.isprintable() and vehicle != HIVE_NULL and len(_vehicle_folder(vehicle)) <= LONGEST_NAME
+
+
+def _vehicle_folder(vehicle: str) -> str:
+    return f"vehicle={quote(vehicle, safe=' ')}"
 
 
 def put(path: Path, content: bytes) -> None:
@@ -109,7 +126,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[
     import pyarrow.parquet as pq
 
     out = BytesIO()
-    pq.write_table(arrow_table(rows, arrow_schema(columns or column_names(rows))), out)
+    pq.write_table(arrow_table(rows, arrow_schema(columns or table_columns(rows))), out)
     put(path, out.getvalue())
 
 

@@ -107,7 +107,7 @@ def _free(effect: Effect, n_wheels: int, values: Mapping[str, Sequence[float]]) 
 def _plain(factor: Factor) -> dict[str, Any]:
     return {
         "falls": dict(factor.falls),
-        "divisor": factor.divisor,
+        "excess": factor.excess,
         "parameters": [f.name for f in factor.own.free],
         "information": factor.own.information.tolist(),
         "information_vector": factor.own.information_vector.tolist(),
@@ -122,7 +122,7 @@ def _factor(effect: Effect, n_wheels: int, plain: Mapping[str, Any]) -> Factor:
     own = OwnParameters(
         np.array(plain["information"], float).reshape(P, P), np.array(plain["information_vector"], float), free
     )
-    return Factor(plain["falls"], plain["divisor"], own)
+    return Factor(plain["falls"], plain["excess"], own)
 
 
 def findings_of_type(

@@ -13,7 +13,9 @@ import gzip
 import hashlib
 import json
 import math
+import os
 import pickle
+import stat
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -179,11 +181,24 @@ def _with_dbcs_here(config: Config, folder: Path) -> Config:
     return _with_dbc(config, input=paths)
 
 
+def place_of(log: str) -> str:
+    """Path or URL of a log without the archive that it lies in (`zip://T7/a.log::fleet.zip`) and a server's query."""
+    place, _, archive = log.partition("::")
+    if "://" not in place:
+        return log
+    return place.partition("?")[0] if place.startswith(("http://", "https://")) and not archive else place
+
+
+def file_name(log: str) -> str:
+    """Name of the file that a path or URL means."""
+    return place_of(log).rpartition("/")[2]
+
+
 def _fetched(url: str, folder: Path) -> Path:
     """Copy of the file at a URL, in a folder that is made; LogError where there is none."""
     from fsspec.core import url_to_fs
 
-    path = folder / url.rpartition("/")[2]
+    path = folder / file_name(url)
     folder.mkdir(exist_ok=True)
     try:
         files, name = url_to_fs(url)
@@ -220,6 +235,7 @@ def part_of(job: Job, version: str) -> Outcome:
     begin, size = time.thread_time(), 0
     try:
         with local_log(job) as path:
+            _check_is_file(path)
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
             outcome = _replayed(job, path)
@@ -228,12 +244,22 @@ def part_of(job: Job, version: str) -> Outcome:
     except MemoryError:
         return Outcome(None, f"{job.log}: not enough memory")
     except OSError as error:
-        return Outcome(None, f"{job.log}: {MISSING if isinstance(error, FileNotFoundError) else one_line(error, 200)}")
+        why = MISSING if isinstance(error, FileNotFoundError) else error.strerror or one_line(error, 200)
+        return Outcome(None, f"{job.log}: {why}")
     except Exception as error:  # a defect of ours, or of a library on a file that it never met
         return Outcome(
             None, f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True, log_bytes=size
         )
     return replace(outcome, cpu_seconds=time.thread_time() - begin, log_bytes=size)
+
+
+def _check_is_file(path: Path) -> None:
+    """LogError where it is a folder, or a pipe or device, which may have no end."""
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise LogError(f"{path}: a folder" + ("" if os.access(path, os.R_OK | os.X_OK) else " that cannot be read"))
+    if not stat.S_ISREG(mode):
+        raise LogError(f"{path}: not a regular file")
 
 
 @contextmanager
@@ -273,13 +299,14 @@ def _part_by_way_of(lines: IO[bytes], job: Job, config: Config, database: Databa
         pipeline = None if database is None else Pipeline(config, database)
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
-                row = summary.row(replace(result, log=job.log))
+                run = (result.log or "").removeprefix(path.name) if pipeline is None else ""  # of a table: its soil bed
+                row = summary.row(replace(result, log=job.log + run))
                 out.write(json.dumps(row, allow_nan=False).encode() + b"\n")
         except LogError as error:
             fault = error
     text = None if fault is None else str(fault).replace(str(path), job.log)
     if fault is not None and not summary.windows:
-        return Outcome(None, text, other_bus=isinstance(fault, OtherBus), lasting=True)
+        return Outcome(None, text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting)
     if not summary.windows:
         text = f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window"
         return Outcome(None, text, lasting=True)

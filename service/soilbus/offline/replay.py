@@ -8,10 +8,12 @@ overlap in two processes, and the results are the same as in one.
 
 from __future__ import annotations
 
+import gc
 import gzip
 import math
 import os
 import sys
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
@@ -49,9 +51,13 @@ MAX_PENDING_WINDOWS = 30
 
 
 class LogError(Exception):
-    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place."""
+    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place.
+
+    `lasting` is False where the fault is of the machine that reads it, not of what is in the log.
+    """
 
     windows = 0
+    lasting = True
 
 
 class OtherBus(LogError):
@@ -93,7 +99,9 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except NotImplementedError:
-        raise LogError(f"{path}: this format needs soilbus[mf4]") from None
+        fault = LogError(f"{path}: this format needs soilbus[mf4]")
+        fault.lasting = False
+        raise fault from None
     except Exception as error:  # python-can's readers raise all kinds on a damaged file
         what = "not a CAN log that can be read" if n == 0 else f"cut off or damaged after {n} frames"
         why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 100)
@@ -106,7 +114,16 @@ def _reader(path: Path) -> Any:
     """python-can's reader; it does not recognise a name such as a.b.log.gz, which is done here."""
     if path.suffixes[-2:] == [".log", ".gz"]:
         return can.CanutilsLogReader(gzip.open(path, "rt"))
-    return can.LogReader(path)
+    usual = sys.unraisablehook
+    try:
+        return can.LogReader(path)
+    except Exception as error:
+        sys.unraisablehook = lambda _: None  # asammdf's destructor fails on what its constructor has left unmade
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+        raise
+    finally:
+        sys.unraisablehook = usual
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:

@@ -43,7 +43,7 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
     """Which vehicles have which fault, since when; content of diagnosis.json in words."""
     lines = [
         f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
-        f"{fleet['false_discovery_rate']:.0%} are expected to be false"
+        f"at most {fleet['false_discovery_rate']:.0%} are expected to be false"
     ]
     for of_type in fleet["types"]:
         for effect in of_type["effects"]:

@@ -22,7 +22,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.posterior import NORMAL_95
+from soilbus.estimation.posterior import NORMAL_95, SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
@@ -63,31 +63,40 @@ def configured(machine: str, cells: str) -> Config | None:
     return config.model_copy(update={"wheel": wheels, "axle": axles if cells == "axle cells" else []})
 
 
-def errors(task: Task) -> Array | None:
-    """Errors of QUANTITIES in reported standard deviations; None where it cannot be driven or is not solved."""
+def window_of(task: Task) -> tuple[ObservationModel, SoilPrior] | None:
+    """The window of a drive and its prior; None where the soil is too soft to drive."""
     config = configured(task.machine, task.cells)
     assert config is not None
-    soil, window = soil_named(task.soil), config.estimator.window
+    settings = config.estimator
     config = config.model_copy(update={"wheel": [wheel.model_copy(update={"sinkage": None}) for wheel in config.wheel]})
-    scenario = Scenario(window, (Patch(0.0, task.soil),), slip=SLIP_RANGE, bounce=task.bounce, drawn_mass=True)
+    soils = (Patch(0.0, task.soil),)
+    scenario = Scenario(settings.window, soils, slip=SLIP_RANGE, bounce=task.bounce, drawn_mass=True)
     try:
         recording, rig = simulate(config, scenario, task.seed), rig_of(config)
     except SimulationError:
         return None
-    store = Bins(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, settings.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    settings = config.estimator
-    problem = ObservationModel(store.window(0.0, window), rig, model_of(config), settings.min_speed, settings.max_turn)
-    prior = prior_about(prior_of(config), soil, np.random.default_rng([task.seed, 1]))
+    window = store.window(0.0, settings.window)
+    problem = ObservationModel(window, rig, model_of(config), settings.min_speed, settings.max_turn)
+    return problem, prior_about(prior_of(config), soil_named(task.soil), np.random.default_rng([task.seed, 1]))
+
+
+def errors(task: Task) -> Array | None:
+    """Errors of QUANTITIES in reported standard deviations; None where it cannot be driven or is not solved."""
+    drive, config, soil = window_of(task), configured(task.machine, task.cells), soil_named(task.soil)
+    if drive is None or config is None:
+        return None
+    problem, prior = drive
     fit = fit_window(problem, prior)
     if fit is None or not fit.converged:
         return None
     posterior = with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit).reported.posterior
-    pressure, tan_phi = posterior.bearing_pressure(settings.z_ref, settings.b_ref), posterior.tan_phi()
+    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
+    pressure, tan_phi = posterior.bearing_pressure(z_ref, b_ref), posterior.tan_phi()
     log_n = np.log(posterior.soil.n / soil.n) / np.sqrt(posterior.log_covariance[2, 2])
-    true = soil.bearing_pressure(settings.z_ref, settings.b_ref)
     return np.array([
-        np.log(pressure.value / true) * pressure.value / pressure.std,
+        np.log(pressure.value / soil.bearing_pressure(z_ref, b_ref)) * pressure.value / pressure.std,
         (tan_phi.value - np.tan(soil.phi)) / tan_phi.std,
         log_n,
     ])  # fmt: skip

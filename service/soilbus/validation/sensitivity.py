@@ -40,7 +40,6 @@ from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
 from soilbus.diagnosis.options import DiagnosisOptions, TypeOptions
 from soilbus.diagnosis.records import Record, TooLittle, record_of
 from soilbus.diagnosis.vehicle_type import Factor, SharedEffect, shared_effect
-from soilbus.diagnosis.verdict import temperature
 from soilbus.estimation import options as of_estimator
 from soilbus.estimation.assembly import model_of, possible_effects, prior_of, rig_of
 from soilbus.estimation.nuisance_parameters import parameters_of
@@ -324,7 +323,7 @@ def factors_of_type(vehicles: int, share_of_own: float, value: float, std: float
         true = 0.15 * rng.normal() if rng.random() < share_of_own else value
         own = OwnParameters(information, information @ [(true + std * rng.normal()) / free[0].std], free)
         fall = -mixture_neg2_log_evidence(own.information, own.information_vector, free)
-        factors.append({GAIN.name: Factor({GAIN.name: fall}, temperature(0.0), own)})
+        factors.append({GAIN.name: Factor({GAIN.name: fall}, 0.0, own)})
     return factors
 
 

@@ -1,0 +1,259 @@
+"""What the user names -> jobs: logs, folders, globs, URLs, and manifests with the vehicle of each log.
+
+LOG...  ->  rows of a manifest, or one row that names LOG itself  ->  logs of each row  ->  a job for each log
+"""
+
+from __future__ import annotations
+
+import csv
+import glob
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from soilbus.config.model import Config
+from soilbus.offline import dataset
+from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
+from soilbus.offline.tables import MISSING_CELLS
+from soilbus.words import one_line
+
+LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
+"""Of logs that python-can reads; each may have .gz behind it."""
+TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
+MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
+SEPARATORS = ",;\t"
+"""Between the cells of a manifest; a spreadsheet writes semicolons where the comma is in numbers."""
+CAN_CSV_COLUMNS = 7
+"""Of a log in the CSV of python-can."""
+
+
+class BatchError(Exception):
+    """The batch cannot be done, or not to its end; the text is one line."""
+
+
+def jobs_of(
+    config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config], parts: Path | None = None
+) -> list[Job]:
+    """The jobs that the arguments of the command stand for, in the order of vehicle and log.
+
+    Parameters
+    ----------
+    config, name
+        The configuration for logs that have none of their own, and its file's name.
+    logs
+        Logs, folders, globs, URLs, or manifests: tables (CSV, Parquet) with a column `log`, and optionally `vehicle`,
+        `configuration` and `start` (ISO 8601, or seconds since 1970).
+    load
+        Reads another configuration.
+    parts
+        Folder of parts to go on with: a log that was read before in a folder that is named here, and that is no longer
+        there, keeps its job.
+
+    Returns
+    -------
+    One job for each log.  Where no manifest names the vehicle, it is that of the folder in which the log lies.
+
+    Raises
+    ------
+    ConfigError
+        A configuration is wrong.
+    BatchError
+        There is no log, or a manifest cannot be read.
+    """
+    setups: dict[Path | None, Setup] = {}
+
+    def setup(path: Path | None) -> Setup:
+        if path not in setups:
+            setups[path] = setup_of(config, name) if path is None else setup_of(load(path), path.name)
+        return setups[path]
+
+    suffixes = TABLE_SUFFIXES if config.table is not None else LOG_SUFFIXES
+    setup(None)
+    jobs: dict[str, Job] = {}
+    before = _logs_of_parts(parts)
+    for argument in logs:
+        for entry in _entries(argument, config.table is not None):
+            own = entry.get("configuration")
+            of_entry = partial(_job, entry, argument, setup(Path(own) if own else None))
+            found = _files(entry["log"], suffixes)
+            own_jobs = [of_entry(log) for log in found]
+            if found != [_absolute(entry["log"])]:
+                gone = {digest: log for digest, log in before.items() if _lies_in(log, entry["log"])}
+                own_jobs += [job for digest, log in gone.items() if (job := of_entry(log)).digest == digest]
+            if not own_jobs:
+                raise BatchError(f"{entry['log']}: no log there")
+            jobs |= {job.digest: job for job in own_jobs}
+    return sorted(jobs.values(), key=lambda job: (job.vehicle, job.log, job.digest))
+
+
+def _job(entry: Mapping[str, str], argument: str, setup: Setup, log: str) -> Job:
+    vehicle = entry.get("vehicle") or place_of(log).rpartition("/")[0].rpartition("/")[2] or "unknown"
+    if not dataset.can_be_folder(vehicle):
+        raise BatchError(f"{argument}: vehicle {vehicle[:60]!r}: no name that a folder of results can have")
+    return Job(log, vehicle, setup, _start(entry.get("start"), argument))
+
+
+def _logs_of_parts(parts: Path | None) -> dict[str, str]:
+    """Logs of which there are parts, by digest."""
+    paths = [] if parts is None else sorted(parts.glob("*.gz"))
+    return {path.stem: summary["log"] for path in paths if (summary := summary_of_part(path)) is not None}
+
+
+def _lies_in(log: str, place: str) -> bool:
+    """Whether a log, there or not, is one that a folder or a glob stands for."""
+    pattern = _absolute(place).rstrip("/")
+    if not glob.has_magic(pattern):
+        return log.startswith(f"{pattern}/")
+    return fnmatchcase(log, pattern) or fnmatchcase(log, f"{pattern}/*")
+
+
+def _absolute(log: str) -> str:
+    return log if "://" in log else os.path.abspath(log)
+
+
+def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
+    """Rows of a manifest, or one row that names the argument itself, which may be a table of a test rig."""
+    path = Path(argument)
+    if path.suffix.lower() not in TABLE_SUFFIXES or not path.is_file():
+        return [{"log": argument}]
+    try:
+        header, rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _parquet_rows(path)
+    except (OSError, ValueError, csv.Error) as error:
+        raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
+    if "log" not in header:
+        if tables or len(header) in (0, CAN_CSV_COLUMNS):
+            return [{"log": argument}]
+        raise BatchError(f"{argument}: a manifest needs a column log; its columns are {', '.join(header) or 'none'}")
+    if not rows:
+        raise BatchError(f"{argument}: no row in it")
+    return [_entry(path, number, row) for number, row in rows]
+
+
+def _entry(manifest: Path, number: int, row: Mapping[str, Any]) -> dict[str, str]:
+    """A row's texts; paths in it begin at the manifest's folder."""
+    texts = {name: _cell(row[name]) for name in MANIFEST_COLUMNS if name in row}
+    if not texts["log"]:
+        raise BatchError(f"{manifest}: row {number} has no log")
+    for name in ("log", "configuration"):
+        text = texts.get(name)
+        if text and "://" not in text and not (name == "configuration" and _is_machine(manifest.parent / text)):
+            texts[name] = str(manifest.parent / text)
+    return texts
+
+
+def _cell(value: Any) -> str:
+    """Text of a cell, empty where it is missing; pandas makes 7.0 of a whole number where others are missing."""
+    if value is None or value != value:
+        return ""
+    return str(int(value) if isinstance(value, float) and value.is_integer() else value).strip()
+
+
+def _is_machine(configuration: Path) -> bool:
+    """Whether this can only be the name of a reference machine."""
+    return not configuration.suffix and not configuration.exists()
+
+
+def _csv_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+    """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
+    with path.open(newline="", encoding="utf-8-sig") as text:
+        first = text.readline()
+        text.seek(0)
+        table = csv.reader(text, delimiter=max(SEPARATORS, key=first.count), strict=True)
+        header = [name.strip().lower() for name in next(table, [])]
+        if "log" not in header:
+            return header, []
+        return header, [
+            (table.line_num, dict(zip(header, row, strict=False))) for row in table if any(map(str.strip, row))
+        ]
+
+
+def _parquet_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+    """Names of columns, and the numbered rows of a manifest."""
+    import pyarrow.parquet as pq
+
+    columns = pq.read_schema(path).names
+    header = [name.strip().lower() for name in columns]
+    if "log" not in header:
+        return header, []
+    wanted = [name for name, plain in zip(columns, header, strict=True) if plain in MANIFEST_COLUMNS]
+    table = pq.read_table(path, columns=wanted)
+    rows = table.rename_columns([name.strip().lower() for name in table.column_names]).to_pylist()
+    return header, list(enumerate(rows, 1))
+
+
+def _start(text: str | None, manifest: str) -> float | None:
+    if not text or text.lower() in MISSING_CELLS:
+        return None
+    with suppress(ValueError):
+        if math.isfinite(seconds := float(text)):
+            return seconds
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        raise BatchError(f"{manifest}: start {text} is neither ISO 8601 nor seconds since 1970") from None
+    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+
+
+def _files(log: str, suffixes: Sequence[str]) -> list[str]:
+    """The logs that a path, a folder, a glob or a URL stands for; of a folder all below it that can be logs."""
+    if "://" in log:
+        return _remote_files(log, suffixes)
+    found = [log]
+    if glob.has_magic(log) and not os.path.lexists(log):
+        found = glob.glob(log, recursive=True)
+    below = (_below(each, suffixes) if os.path.isdir(each) else [_absolute(each)] for each in found)
+    return sorted(set(chain.from_iterable(below)))
+
+
+def _below(folder: str, suffixes: Sequence[str]) -> list[str]:
+    """What is named as logs are below a folder, behind links too, and each folder that cannot be read."""
+    found: list[str] = []
+    root = os.path.abspath(folder)
+    walk = os.walk(root, followlinks=True, onerror=lambda error: found.append(error.filename))
+    for place, folders, names in walk:
+        folders[:] = [name for name in folders if not _is_double(Path(place, name), Path(root))]
+        logs = [Path(place, name) for name in (*folders, *names) if _is_log(name, suffixes)]
+        found += [
+            str(log) for log in logs if not (_is_double(log, Path(root)) and _is_log(log.resolve().name, suffixes))
+        ]
+    return found
+
+
+def _is_double(path: Path, root: Path) -> bool:
+    """Whether this is a link to what is found below `root` anyway, or to a folder that it lies in itself."""
+    if not path.is_symlink():
+        return False
+    target, ends = Path(os.path.realpath(path)), len(root.parents)
+    above = [each for each in path.parents if len(each.parents) >= ends]
+    return target.is_relative_to(os.path.realpath(root)) or any(
+        Path(os.path.realpath(each)).is_relative_to(target) for each in above
+    )
+
+
+def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
+    from fsspec.core import url_to_fs
+
+    place, _, archive = url.partition("::")
+    archive = f"::{archive}" if archive and "://" in place else ""
+    try:
+        files, name = url_to_fs(url)
+        if glob.has_magic(place_of(url)):
+            return sorted(str(files.unstrip_protocol(each)) + archive for each in files.glob(name))
+        # over HTTP a file that is asked whether it is a folder is read as a page of links
+        if not _is_log(file_name(url), suffixes) and files.isdir(name):
+            found = [each for each in files.find(name) if _is_log(each, suffixes)]
+            return sorted(str(files.unstrip_protocol(each)) + archive for each in found)
+    except Exception as error:  # each protocol has its own
+        raise BatchError(f"{url}: {one_line(error, 150)}") from None
+    return [url]
+
+
+def _is_log(name: str, suffixes: Sequence[str]) -> bool:
+    return Path(name.lower().removesuffix(".gz")).suffix in suffixes

@@ -1,0 +1,54 @@
+"""What the formula of a true effect leaves gets no name, whoever has put that effect into the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+from soilbus.diagnosis.diagnose import diagnose
+from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.fleet import diagnose_type
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.nuisance_parameters import parameters_of
+from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.validation.blind.cases import cases
+from soilbus.validation.blind.trial import record_of_case
+from soilbus.validation.fleet import Fault, fleet
+
+PRIOR = prior_of(reference_configuration())
+TYRE = CATALOGUE["tyre_deflection"]
+"""Hidden below as forms that are not the catalogue's."""
+
+
+def test_beside_a_large_effect_in_one_search():
+    case = next(islice(cases("single", 506), 98, None))
+    assert case.hidden == ("grade",)
+    candidates = [CATALOGUE[name] for name in ("grade", "bulldozing", "multipass", "draft_offset")]
+    found = diagnose([record_of_case(case)], prior_of(case.config), candidates)
+    assert [addition.effect.name for addition in found.additions] == ["grade"]
+
+
+def test_beside_an_effect_of_the_configuration():
+    """As `diagnose --model-out` writes it from one log, and a second log is diagnosed beside it."""
+    hidden = fleet(33, {}, Fault("tyre_deflection:spring", 1.1e-6), vehicles=2, logs=2)
+    first, second = hidden.vehicles[1]
+    fitted = fit_model([first], PRIOR, [TYRE])
+    assert fitted is not None
+    values = fitted.parameters()[TYRE.name]
+    free = [
+        replace(f, value=values[f.parameter.name].value, std=values[f.parameter.name].std)
+        for f in parameters_of(TYRE, 4)
+    ]
+    others = [CATALOGUE[name] for name in ("stress_peak_shift", "multipass", "bulldozing")]
+    found = diagnose([second.with_effects([TYRE], free)], PRIOR, others)
+    assert found.additions == ()
+
+
+def test_beside_an_effect_of_the_type():
+    hidden = fleet(33, {}, Fault("tyre_deflection:power", 0.007), vehicles=3, logs=1)
+    candidates = [TYRE, *(CATALOGUE[n] for n in ("rut_recovery", "drivetrain_loss", "lugs", "multipass"))]
+    shared, _ = diagnose_type(hidden.vehicles, PRIOR, candidates)
+    chances = {one.effect.name: one.probability for one in shared}
+    assert chances.pop("tyre_deflection") > 0.5
+    assert max(chances.values(), default=0.0) < 0.2
