@@ -846,7 +846,7 @@ class Output(_Section):
 
     dbc: str = "soilbus.dbc"
     """Layout of our own frames."""
-    compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field((5.0e4, 1.0e5, 2.0e5), strict=False)
+    compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(default=(5.0e4, 1.0e5, 2.0e5), strict=False)
     """Bearing pressures [Pa] from which the soil counts as slightly compacted, compacted, very compacted: codes 2, 3, 4
     of DDI 470 in `replay --isoxml`.  A tyre presses on soft ground about as hard as it is inflated (Wong 2008, ch. 2):
     from 0.5, 1, 2 bar on the ground carries a tyre of that pressure with a rut of at most `estimator.z_ref`."""
