@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from soilbus.cli.main import main
-from soilbus.config.file import load_config, overridden, parse_config
+from soilbus.config.file import load_config, machine, overridden, parse_config
 from soilbus.config.model import Config, ConfigError
 
 FIELD = Path(__file__).resolve().parent / "field/field.toml"
@@ -76,6 +76,12 @@ def faults(*sets: str) -> list[str]:
         ('wheel={name="FL"}', "wheel: write [[wheel]], in two brackets, once for each wheel"),
         ("traversability.hold=1.5", "traversability.hold: 1.5 is not a whole number"),
         ("wheel.FX.radius=0.5", "--set wheel.FX.radius=0.5: no wheel.FX; there are FL, FR, RL, RR"),
+        ("wheel.FL.radius=true", "wheel.FL.radius: true is not a number"),
+        ('vehicle.mass="2300"', 'vehicle.mass: "2300" is not a number; without quotes'),
+        ("wheel.FL.driven=0", "wheel.FL.driven: 0 is neither true nor false"),
+        ("signals.towing=never", "signals.towing: unknown key here; it belongs in [vehicle]"),
+        ("wheel.FL.differential=open", "wheel.FL.differential: unknown key here; it belongs in [[axle]]"),
+        ('axle={name="rear"}', "axle: write [[axle]], in two brackets, once for each axle"),
     ],
 )
 def test_a_mistake_is_told_in_words_of_the_file(override, line):
@@ -104,6 +110,46 @@ def test_a_name_that_is_nearly_right_is_asked_for(override, words, capsys):
 def test_a_soil_that_is_nearly_right_is_asked_for(tmp_path, capsys):
     assert main(["simulate", "--soil", "lome", "--log", str(tmp_path / "x.log")]) == 1
     assert "no soil is named lome; did you mean loam?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["mass", "cg_ahead_of_rear_axle"])
+def test_a_deviation_that_is_given_twice_is_refused(key):
+    with pytest.raises(ConfigError, match=rf"{key} = {{ value, std }} and \w+_std are the same"):
+        load_config(machine("tractor-2wd"), [f"vehicle.{'cg' if key.startswith('cg') else key}_std=0.01"])
+
+
+def test_a_list_of_numbers_may_hold_whole_ones():
+    assert load_config(FIELD, ["output.compaction=[50000, 100000, 2e5]"]).output.compaction == (5e4, 1e5, 2e5)
+
+
+@pytest.mark.parametrize("key", ["max_torque=5000.0", 'motor_speed="MotorFront.ShaftSpeed"'])
+def test_an_axle_of_free_wheels_has_no_motor(key):
+    raw = tomllib.loads(machine("tractor-2wd").read_text())
+    raw["axle"].append({"name": "front"} | tomllib.loads(key))
+    with pytest.raises(ConfigError, match=f"axle front has a {key.split('=')[0]}, but each of its wheels has driven"):
+        parse_config(raw)
+
+
+TRACK = {"contact_length": 2.6, "width": 0.45, "sprocket_radius": 0.35}
+
+
+@pytest.mark.parametrize(
+    ("left", "line"),
+    [
+        ({"contact_length": "2.6 m"}, 'track.L.contact_length: "2.6 m" is not a number'),
+        ({"contact_length": None}, "track.L.contact_length: missing"),
+        ({"axle": "rear"}, "give the axle of all [[track]]s or, where they carry the whole vehicle, of none"),
+        ({"driven": False, "torque": "A.B"}, "track.L: track L has driven = false and a torque: leave out one of"),
+        ({"name": "R"}, "two tracks are named R"),
+    ],
+)
+def test_a_mistake_in_a_track_is_one_line_of_that_track(left, line):
+    tracks = [{"name": "L"} | TRACK | left, {"name": "R"} | TRACK]
+    tracks[0] = {key: value for key, value in tracks[0].items() if value is not None}
+    with pytest.raises(ConfigError) as error:
+        parse_config({"vehicle": {"mass": 6000.0, "cg_height": 0.9}, "track": tracks}, source="f")
+    (only,) = error.value.faults
+    assert only.startswith(f"f: {line}")
 
 
 # --- wheels that are not measured ---
@@ -172,6 +218,48 @@ def test_noise_that_is_not_given_is_told(tmp_path, capsys):
     lines = warnings(path, capsys)
     assert len(lines) == 1
     assert "[noise] does not give load, draft" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("vehicle.towing=unknown", "signals.draft is mapped and counts"),
+        ("vehicle.steering=skid", "with neither vehicle.track nor signals.yaw_rate"),
+        ("wheel.FL.gear_ratio=24", "wheel.FL.gear_ratio = 24 concerns no signal of it"),
+    ],
+)
+def test_what_contradicts_the_mapped_signals_or_concerns_none_is_said(override, says, capsys, tmp_path):
+    text = machine("tractor-2wd").read_text().replace('speed = "WheelSpeeds.FL"\n', "").replace("track = 1.50\n", "")
+    (tmp_path / "c.toml").write_text(text)
+    noise = "noise.acceleration.absolute=0.005"
+    (line,) = warnings(tmp_path / "c.toml", capsys, override, noise)
+    assert says in line
+
+
+def test_a_draft_that_nothing_measures_is_said_to_leave_no_go(capsys, tmp_path):
+    raw = machine("tractor-2wd").read_text()
+    (tmp_path / "c.toml").write_text(raw.replace('[signals.draft]\nsignal = "DrawbarPin.Draft"\nvalid = "Valid"\n', ""))
+    (line,) = warnings(tmp_path / "c.toml", capsys)
+    assert "signals.draft is not mapped" in line
+    assert "no GO" in line
+    assert warnings(tmp_path / "c.toml", capsys, "vehicle.towing=never") == []
+
+
+@pytest.mark.parametrize("kind", ["kinematic", "specific_force"])
+def test_slopes_that_nothing_shows_are_said_to_count_as_drafts(kind, capsys, tmp_path):
+    text = machine("tractor-2wd").read_text().replace('pitch = "Attitude.Pitch"\n', "")
+    (tmp_path / "c.toml").write_text(text)
+    lines = warnings(tmp_path / "c.toml", capsys, f"signals.acceleration.kind={kind}")
+    assert ["the ground counts as level" in line for line in lines] == [True] * (kind == "kinematic")
+
+
+def test_the_settings_in_force_name_each_wheel_and_axle(capsys):
+    assert main(["check", "--config", "tractor-2wd"]) == 0
+    out = capsys.readouterr().out
+    assert "\nwheel.FL.driven = False\n" in out
+    assert "\naxle.rear.max_torque = 16000.0\n" in out
+    assert "\nRL and RR are weighed together:" in out
+    assert "\nNo load cell at FL, FR:" in out
 
 
 def test_a_cohesion_in_kilopascals_is_warned_of(capsys):

@@ -367,6 +367,50 @@ def test_a_reference_torque_is_for_a_percentage_of_torque(tmp_path, wheel, fault
     assert fault in line
 
 
+def test_the_pressure_of_air_springs_carries_the_load(tmp_path):
+    (tmp_path / "air.dbc").write_text('VERSION ""\nBU_: A\nBO_ 9 Air: 8 A\n SG_ P : 0|16@1+ (2,0) [0|2000] "kPa" A\n')
+    springs = {"signal": "Air.P", "effective_area": 0.06, "unsprung_mass": 300.0}
+    c = config(tmp_path, "air.dbc", load=springs)
+    admission = Admission(channels_of(c, load_databases(c)), load_databases(c))
+    admission.feed(1.0, 9, False, (200).to_bytes(2, "little") + bytes(6))
+    assert admission.take().columns["load.W"].value == pytest.approx([400e3 * 0.06 + 300.0 * G])
+
+
+@pytest.mark.parametrize(
+    ("quantity", "mapped", "line"),
+    [
+        ("load", "Air.P", "P is in kPa, a pressure: give effective_area [m^2]"),
+        ("torque", {"signal": "Air.P", "effective_area": 0.06}, "effective_area has no meaning for torque"),
+        ("load", {"signal": "Air.F", "effective_area": 0.06}, "F is in N; with effective_area it must be a pressure"),
+        ("torque", "Air.I", "I is in A, a current: give its torque_constant [N m/A]"),
+    ],
+)
+def test_a_pressure_or_a_current_is_asked_for_its_factor(quantity, mapped, line, tmp_path):
+    signals = ' SG_ P : 0|16@1+ (2,0) [0|2000] "kPa" A\n SG_ F : 16|16@1+ (2,0) [0|2000] "N" A\n'
+    signals += ' SG_ I : 32|16@1+ (1,0) [0|2000] "A" A\n'
+    (tmp_path / "air.dbc").write_text('VERSION ""\nBU_: A\nBO_ 9 Air: 8 A\n' + signals)
+    c = config(tmp_path, "air.dbc", **{quantity: mapped})
+    with pytest.raises(ConfigError) as error:
+        channels_of(c, load_databases(c))
+    assert error.value.faults[0].startswith(f"wheel.W.{quantity}: {line}")
+
+
+def test_an_unsprung_mass_belongs_to_air_springs(tmp_path):
+    with pytest.raises(ConfigError, match="give their effective_area"):
+        config(tmp_path, load={"signal": "Wheel.Load", "unsprung_mass": 300.0})
+
+
+def test_the_state_of_a_differential_lock_has_no_unit(tmp_path):
+    (tmp_path / "a.dbc").write_text(DBC, encoding="utf-8")
+    raw = {"dbc": {"input": ["a.dbc"]}, "wheel": [WHEEL], "vehicle": VEHICLE | {"differential_lock": "Motor.Speed"}}
+    c = parse_config(raw, folder=tmp_path)
+    with pytest.raises(ConfigError, match="Speed is in rpm; differential_lock is a state"):
+        channels_of(c, load_databases(c))
+    raw["vehicle"] = VEHICLE | {"differential_lock": "Motor.State"}
+    c = parse_config(raw, folder=tmp_path)
+    assert without_unit(channels_of(c, load_databases(c)), load_databases(c)) == []
+
+
 def test_a_current_and_a_percentage_exclude_each_other(tmp_path):
     both = {"signal": "Wheel.Grade", "reference_torque": 800.0, "torque_constant": 0.6}
     with pytest.raises(ConfigError, match="leave out one of the two"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, machine, parse_config
 from soilbus.offline.replay import read_frames
 from soilbus.pipeline.intake import Intake
 from soilbus.simulator.frames import frames
@@ -93,6 +94,21 @@ def test_live_and_replay_give_the_same_windows(every, glimpse, loam):
         assert (a.rejected, a.slip, a.window.samples) == (b.rejected, b.slip, b.window.samples)
         assert all(np.array_equal(getattr(a.window, q), getattr(b.window, q), equal_nan=True) for q in QUANTITIES)
     assert intake.refusals.total["outlier"] > 10
+
+
+def test_a_wheel_without_a_speed_sensor_has_no_slip():
+    raw = tomllib.loads(machine("tractor-2wd").read_text())
+    for wheel in raw["wheel"]:
+        del wheel["speed"]
+    config = parse_config(raw)
+    intake = Intake(config, load_databases(config))
+    for message in frames(simulate(config, excited("loam", 11.5), seed=3), config):
+        feed_message(intake.admission, message)
+    slip = intake.finish(message.timestamp)[0].slip
+    assert slip["FL"] is None
+    assert slip["FR"] is None
+    assert slip["RL"] == pytest.approx(slip["RR"])  # that of their motor
+    assert 0.05 < slip["RL"] < 0.5
 
 
 def test_slip_in_reverse_is_that_of_the_same_drive_forward():

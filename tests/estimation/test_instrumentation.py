@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 import shaking
 from soilbus.can.channels import Column, Decoded
 from soilbus.can.mapping import load_databases
-from soilbus.config.file import found_configuration, load_config
+from soilbus.config.file import found_configuration, load_config, parse_config
 from soilbus.config.model import Axle, Signal
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
@@ -28,8 +29,10 @@ from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import GRAVITY
+from soilbus.terra.wheel import Soil, state_on, wheel_forces
 
 FIELD = Path(__file__).parents[1] / "field" / "field.toml"
 PLAIN = re.sub(r'\nsinkage = "[^"]*"', "", FIELD.read_text())
@@ -365,3 +368,43 @@ def test_check_says_that_a_missing_load_cell_costs_precision(name):
     pressure, with_cells, tan_phi, tan_phi_with_cells = (float(x) for x in re.findall(r"([\d.]+)%", line))
     assert with_cells < pressure < 2.0 * with_cells
     assert tan_phi > 0.95 * tan_phi_with_cells
+
+
+def never_towing():
+    """The machine with a motor on each axle, which tows nothing."""
+    raw = tomllib.loads(found_configuration("tractor-axles").read_text())
+    del raw["signals"]["draft"]
+    raw["vehicle"]["towing"] = "never"
+    return parse_config(raw)
+
+
+def test_where_nothing_is_towed_slopes_take_the_pull_of_the_modelled_drive():
+    config = never_towing()
+    rig, model = rig_of(config), model_of(config)
+    truth = modelled_drive(config, rig, np.arange(0.05, 10.0, 0.1))
+    radius, width = rig.radius[:, None], rig.width[:, None]
+    slip = 1.0 - truth["ground_speed"] / (radius * truth["speed"])
+    state = state_on(Soil(*prior_of(config).median), np.nan, slip, radius, width)
+    entry = entry_angle_for_load(truth["load"], state, model)
+    pull = wheel_forces(state._replace(entry_angle=entry), model)[1].sum(axis=0)
+    assert np.ptp(truth["pitch"]) > 0.1
+    assert np.all(truth["draft"] == 0.0)
+    assert pull == pytest.approx(rig.chassis.mass * GRAVITY * np.sin(truth["pitch"]), rel=0.02, abs=50.0)
+
+
+@pytest.mark.parametrize("felt", ["pitch", "specific force", "nothing"])
+def test_where_nothing_is_towed_the_balance_counts_only_where_a_sensor_shows_the_slope(felt):
+    rig = replace(rig_of(never_towing()), specific_force=felt == "specific force")
+    window = window_of(never_towing(), rig)
+    unknown = np.full(len(window.t), np.nan)
+    window = replace(window, pitch=np.zeros(len(window.t)) if felt == "pitch" else unknown)
+    window = completed(window if felt == "specific force" else replace(window, acceleration=unknown), rig)
+    weight = rig.chassis.mass * GRAVITY
+    assert np.all(window.draft == 0.0)
+    assert np.all(window.variance["draft"] == 0.0) == (felt != "nothing")
+    assert felt != "nothing" or np.all(window.variance["draft"] > (0.1 * weight) ** 2)
+
+
+def test_check_predicts_the_errors_of_a_machine_that_tows_nothing():
+    (line,) = [line for line in load_lines(never_towing()) if "with load cells" in line]
+    assert "varied slope" in line

@@ -88,7 +88,7 @@ def test_an_effect_of_tyres_is_not_for_tracks():
         ("track.R.pitch=0.1", "needs sprocket_radius, or pitch and sprocket_teeth"),
         ("track.R.roller_spacing=0.4", "the same number of rollers"),
         ("track.L.roller_spacing=1.9", "greater than contact_length"),
-        ("track.L.name=R", "two wheels are named R"),
+        ("track.L.name=R", "two tracks are named R"),
     ],
 )
 def test_faults_of_a_track_are_said_by_its_keys(override, said):

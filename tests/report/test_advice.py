@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.decision.traversability import Status, Traversability
+from soilbus.estimation.posterior import Estimate
 from soilbus.offline.replay import replay
 from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.pipeline import Pipeline
@@ -111,3 +113,18 @@ def test_one_cell_for_two_wheels_is_named_where_the_model_does_not_fit(tmp_path)
     assert "load.FL is mapped for several wheels" in summary_of(of_shared, "a drive", None, Counter())
     assert {w.reason for w in of_alone} == {"none"}
     assert any("WheelLoads.FL" in line and "for that one alone" in line for line in configuration_warnings(shared))
+
+
+def test_a_draft_that_never_is_is_not_said_to_have_moved():
+    nothing = window("ambiguous", Status.NOT_EXCITED, excitation=Excitation(0.0, 0.0, 0.2, 0.05))
+    text = summary_of([nothing], "a drive", None, Counter())
+    assert "vary the load more: slip was 20.0 ± 5.0 %" in text
+
+
+@pytest.mark.parametrize("draft", [None, 900.0])
+def test_the_summary_says_why_no_go_is_given_without_a_draft(draft):
+    could = Traversability(max_draft=Estimate(9000.0, 500.0))
+    seen = window("none", Status.VALID, excitation=Excitation(draft, draft))
+    seen = replace(seen, traversability=could, bearing=Estimate(1e5, 5e3))
+    text = summary_of([seen], "a log", None, Counter())
+    assert ("no sensor shows the draft" in text) is (draft is None)

@@ -485,3 +485,13 @@ def test_before_a_status_was_heard_no_estimate_is_called_old():
     desk = Desk()
     desk.send("Traversability", State="unknown")
     assert desk.dashboard.verdict().said == "UNKNOWN: no status of soilbus"
+
+
+@pytest.mark.parametrize(
+    ("draft", "said"), [(None, "UNKNOWN: no sensor shows the draft"), (1200.0, "UNKNOWN: the estimate is too old")]
+)
+def test_a_draft_that_no_sensor_shows_is_why_a_good_estimate_gives_no_state(desk, draft, said):
+    desk.send("Traversability", State="unknown")
+    desk.send("SoilbusStatus", State="valid", Reason="none", Window=7)
+    desk.send("PresentDemand", Draft=draft)
+    assert desk.dashboard.verdict().said == said

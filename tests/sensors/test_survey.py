@@ -428,12 +428,19 @@ def test_the_machine_with_one_motor_is_configured_without_fault(rear_drive):
         ("axle.rear.motor_speed.sign=-1", "axle.rear.motor_speed: turns backward"),
         ("wheel.FL.radius=0.9", "wheel.FL: rolls freely, but its rim goes 1.8"),
         ("vehicle.mass=2000.0", "the rear axle alone carries 2"),
+        ("axle.rear.differential=locked", 'axle.rear.differential = "locked", but the speeds of RL and RR differ by'),
     ],
 )
 def test_a_mistake_about_an_axle_or_a_free_wheel_is_named(override, says, rear_drive):
     found = beside(reference_configuration([override], path=REAR_DRIVE), rear_drive)
     assert [fault for fault in found.faults if says in fault] == found.faults[:1]
     assert len(found.faults) >= 1
+
+
+def test_a_locked_differential_turns_both_wheels_alike():
+    config = reference_configuration(["axle.rear.differential=locked"], path=REAR_DRIVE)
+    recording = simulate(config, scenario_over(["loam"], 20.0), 5)
+    assert beside(config, [frame_of(message) for message in frames(recording, config)]).findings == ()
 
 
 def test_a_draft_that_is_known_to_be_none_is_no_frozen_sensor(tmp_path):

@@ -1,12 +1,15 @@
 """Wheels of simulated machines turn as their motors, differentials and bearings let them."""
 
+import csv
 import math
+import re
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from soilbus.cli.main import main
 from soilbus.config.file import MACHINES, load_config, parse_config
 from soilbus.simulator.drive import SimulationError, drive
 from soilbus.simulator.frames import frames
@@ -221,6 +224,28 @@ def test_towing_what_is_never_towed_is_refused_in_one_line():
     for more in ({"draft": Swing(0.0, 100.0), "slip": None}, {"slope": ((0.0, 0.0), (9.0, 0.1))}):
         with pytest.raises(SimulationError, match=r"^vehicle.towing = never[^\n]+$"):
             drive(MACHINES["towing nothing"], on(**more), seed=1)
+
+
+@pytest.fixture
+def never_towing(tmp_path):
+    """The configuration of the machine with axle motors, which tows nothing."""
+    text = re.sub(r"\[signals\.draft\]\n(?:.+\n)+", "", (FOLDER / "tractor-axles.toml").read_text())
+    (tmp_path / "c.toml").write_text(text.replace("[vehicle]", '[vehicle]\ntowing = "never"'))
+    return str(tmp_path / "c.toml")
+
+
+def test_decisions_about_drafts_are_not_tried_where_nothing_is_towed(never_towing, capsys):
+    assert main(["decisions", "--config", never_towing]) == 2
+    assert "this vehicle never has" in capsys.readouterr().err
+
+
+def test_a_machine_that_tows_nothing_drives_up_a_slope_that_is_given(never_towing, tmp_path):
+    command = ["simulate", "--config", never_towing, "--slope", "12", "--duration", "3"]
+    assert main([*command, "--log", str(tmp_path / "x.log"), "--truth", str(tmp_path / "x.csv")]) == 0
+    with (tmp_path / "x.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["pitch"]) for row in rows] == pytest.approx([math.atan(0.12)] * len(rows))
+    assert min(float(row["slip.RL"]) for row in rows) > 0.05
 
 
 def test_mass_and_centre_of_gravity_are_as_configured_or_drawn_about_that():

@@ -11,6 +11,7 @@ import pytest
 
 import soilbus.validation.monte_carlo as of_room
 from soilbus.cli.main import main
+from soilbus.config.file import load_config, machine
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
@@ -213,3 +214,11 @@ def test_a_configuration_without_a_vehicle_is_one_line(tmp_path, capsys):
     empty.write_text("")
     assert main(["montecarlo", "--config", str(empty), "--windows", "1"]) == 1
     assert capsys.readouterr().err.splitlines() == ["soilbus: the simulator needs a [vehicle] with [[wheel]]s"]
+
+
+@pytest.mark.parametrize("name", ["tractor-2wd", "tractor-axles"])
+def test_windows_of_machines_with_motors_of_axles_have_a_bound(name):
+    (cell, _) = monte_carlo(load_config(machine(name)), 2, 1, soils=("loam",), durations=(10.0,))
+    assert cell.failed == cell.not_converged == 0
+    assert np.all((cell.bound > 0.0) & (cell.bound < 2.0))
+    assert np.all(cell.rms < 4.0)

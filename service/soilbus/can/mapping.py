@@ -65,6 +65,8 @@ _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
 
 _CURRENTS = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
 """Ampere in units of a motor's current."""
+_PRESSURES = {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757}
+"""Pascal in units of an air spring's pressure."""
 
 
 class _Fault(Exception):
@@ -102,13 +104,20 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
 
 def without_unit(channels: Iterable[Channel], database: Database) -> list[Channel]:
     """Channels whose signal has no unit, so that SI was assumed."""
-    return [c for c in channels if _is_bare(_signal(c, database))]
+    return [c for c in channels if c.quantity != LOCK and _is_bare(_signal(c, database))]
 
 
 def _is_bare(signal: Signal) -> bool:
     try:
         return unit_of(signal.unit) is None
-    except ValueError:  # ampere or per cent of a torque
+    except ValueError:  # ampere, per cent of a torque or a pressure
+        return False
+
+
+def _has_dimension(signal: Signal) -> bool:
+    try:
+        return unit_of(signal.unit) is not None
+    except ValueError:
         return False
 
 
@@ -152,7 +161,7 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         message=message.name,
         signal=signal.name,
         factor=_factor(role, signal),
-        offset=0.0,
+        offset=STANDARD_GRAVITY * role.mapped.unsprung_mass,
         low=low,
         high=high,
         valid_signal=valid_signal,
@@ -234,23 +243,48 @@ def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
     """Dimension and factor to SI of a signal, which must suit the quantity; no unit means SI."""
     fitting = _DIMENSIONS[quantity]
     if fitting == ("",):
-        return "", 1.0  # a code
+        return _code(quantity, signal)
     if mapped.torque_constant is not None:
         return _current(quantity, signal, mapped.torque_constant)
     if mapped.reference_torque is not None:
         return _percentage(quantity, signal, mapped.reference_torque)
+    if mapped.effective_area is not None:
+        return _pressure(quantity, signal, mapped.effective_area)
     wanted = " or ".join(SI[dimension] for dimension in fitting)
     try:
         unit = unit_of(signal.unit)
     except ValueError as error:
+        spelled = (signal.unit or "").strip()
+        if spelled in _CURRENTS and quantity in ("torque", "torque_limit"):
+            raise _Fault(f"{signal.name} is in {spelled}, a current: give its torque_constant [N m/A]") from None
+        if spelled in _PRESSURES and quantity == "load":
+            raise _Fault(f"{signal.name} is in {spelled}, a pressure: give effective_area [m^2]") from None
         raise _Fault(f"{signal.name}: {error} ({quantity} needs {wanted})") from None
     if unit is None:
         if quantity in POSITION_ROLES:
             raise _Fault(f"{signal.name} has no unit: write deg or rad in the DBC")
         return fitting[0], 1.0
     if unit.dimension not in fitting:
-        raise _Fault(f"{signal.name} is in {signal.unit}, a {unit.dimension}; {quantity} needs {wanted}")
+        article = "an" if unit.dimension[0] in "ai" else "a"
+        raise _Fault(f"{signal.name} is in {signal.unit}, {article} {unit.dimension}; {quantity} needs {wanted}")
     return unit.dimension, unit.factor
+
+
+def _code(quantity: str, signal: Signal) -> tuple[str, float]:
+    """No dimension; a fault for a signal with a unit of one."""
+    if _has_dimension(signal):
+        raise _Fault(f"{signal.name} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
+    return "", 1.0
+
+
+def _pressure(quantity: str, signal: Signal, area: float) -> tuple[str, float]:
+    """Force for a unit of the pressure in springs of this effective area [m^2]."""
+    if quantity != "load":
+        raise _Fault(f"effective_area has no meaning for {quantity}")
+    unit = _PRESSURES.get((signal.unit or "Pa").strip())
+    if unit is None:
+        raise _Fault(f"{signal.name} is in {signal.unit}; with effective_area it must be a pressure in Pa, kPa or bar")
+    return "force", area * unit
 
 
 def _current(quantity: str, signal: Signal, torque_constant: float) -> tuple[str, float]:

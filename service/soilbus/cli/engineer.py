@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -228,6 +229,8 @@ def simulate(args: argparse.Namespace) -> None:
         scenario = scenario_over(
             args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
         )
+        if _nothing_towed(config) and args.slope:
+            scenario = replace(scenario, slip=None)  # which would make slopes of its own
         if args.manoeuvre is not None:
             scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
         bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
@@ -248,8 +251,11 @@ def _of_manoeuvre(path: Path, scenario: Scenario, config: Config) -> Scenario:
         raise WorkError(f"{path}: {error.strerror or error}") from None
     except ValueError as error:
         raise WorkError(f"{path}: {error}") from None
-    nothing_towed = config.vehicle is not None and config.vehicle.towing == "never"
-    return manoeuvre.over(scenario, nothing_towed)
+    return manoeuvre.over(scenario, _nothing_towed(config))
+
+
+def _nothing_towed(config: Config) -> bool:
+    return config.vehicle is not None and config.vehicle.towing == "never"
 
 
 def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:

@@ -47,6 +47,7 @@ def decisions(args: argparse.Namespace) -> None:
     """`soilbus decisions`: predictions beside what simulated drives then do."""
     import json
 
+    from soilbus.config.model import ConfigError
     from soilbus.simulator.drive import SimulationError
     from soilbus.validation.bogging_trials import warning_trials
     from soilbus.validation.decisions_report import as_json, decisions_report
@@ -55,6 +56,8 @@ def decisions(args: argparse.Namespace) -> None:
     from soilbus.validation.verdict_trials import verdict_trials
 
     config = configured_or_reference(args)
+    if config.vehicle is not None and config.vehicle.towing == "never":
+        raise ConfigError(['vehicle.towing = "never": decisions are tried by drafts, which this vehicle never has'])
     try:
         with processes(os.cpu_count() or 1) as each:
             drafts = list(draft_trials(config, args.drives, args.seed, each=each))

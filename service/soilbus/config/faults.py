@@ -69,7 +69,7 @@ def _text(error: Any) -> str:
     if kind == "value_error":
         return str(error["msg"]).removeprefix("Value error, ")
     if kind == "extra_forbidden":
-        return f"unknown key{did_you_mean(str(error['loc'][-1]), _keys(error['loc'][:-1]))}"
+        return _unknown_key(error["loc"])
     if kind == "missing":
         return "missing"
     if kind == "string_pattern_mismatch":
@@ -83,6 +83,20 @@ def _text(error: Any) -> str:
         return _list_wanted(error["loc"], given)
     sentence = _SENTENCES.get(kind)
     return sentence(given, context) if sentence is not None else f"{_shown(given)} cannot be used here"
+
+
+def _unknown_key(location: Sequence[Any]) -> str:
+    """Where the key belongs, if it is one of another section of the machine, or else which one was meant."""
+    key = str(location[-1])
+    tables = [name for name in _OF_MACHINE if key in _keys((name,))]
+    places = [f"[[{name}]]" if name in _REPEATED else f"[{name}]" for name in tables]
+    if places:
+        return f"unknown key here; it belongs in {' or '.join(places)}"
+    return f"unknown key{did_you_mean(key, _keys(location[:-1]))}"
+
+
+_REPEATED = ("axle", "wheel", "track")
+_OF_MACHINE = ("vehicle", *_REPEATED, "signals")
 
 
 def _number(given: Any, _: Mapping[str, Any]) -> str:
@@ -134,7 +148,7 @@ def _table_wanted(location: Sequence[Any], given: Any) -> str:
 
 def _list_wanted(location: Sequence[Any], given: Any) -> str:
     key = location[-1]
-    if key in ("wheel", "track"):
+    if key in _REPEATED:
         return f"write [[{key}]], in two brackets, once for each {key}"
     if key == "effects" or isinstance(given, Mapping):
         return f'{_shown(given)} is not a list of tables, such as {key} = [{{ name = "..." }}]'

@@ -122,6 +122,7 @@ MASS_STD = Usual(0.0, 3.0e4, "kg", (("t", 1e3),))
 LENGTH_STD = Usual(0.0, 4.0, "m", _SHORT)
 GEAR_RATIO = Usual(0.1, 1000.0, "")
 WHEEL_TORQUE = Usual(5.0, 2.0e5, "N m", (("kN m", 1e3),))
+SPRING_AREA = Usual(1.0e-4, 1.0, "m^2", (("cm^2", 1e-4), ("mm^2", 1e-6)))
 AXLE_TORQUE = Usual(10.0, 4.0e5, "N m", (("kN m", 1e3),))
 WINDOW = Usual(0.5, 600.0, "s", (("ms", 1e-3),))
 SHARE = Usual(0.0, 1.0, "", (("%", 1e-2),))
@@ -136,7 +137,7 @@ SHEAR_LENGTH = Usual(0.0, 0.5, "m", _SHORT)
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
 class Bus(BaseModel):
@@ -194,6 +195,16 @@ class Signal(_Section):
     reference_torque: PositiveFloat | None = None
     """Torque of 100 % [N m], where a percentage of it is mapped: in J1939 SPN 513, of the engine's reference torque,
     SPN 544."""
+    effective_area: Annotated[PositiveFloat, AfterValidator(SPRING_AREA)] | None = None
+    """Of an axle's air springs together [m^2], where their pressure is mapped to its load: force over pressure."""
+    unsprung_mass: NonNegativeFloat = 0.0
+    """What the air springs do not carry [kg]: axle and wheels; added to the load that their pressure gives."""
+
+    @model_validator(mode="after")
+    def _unsprung_beside_springs(self) -> Signal:
+        if self.unsprung_mass and self.effective_area is None:
+            raise ValueError("unsprung_mass is for the pressure of air springs: give their effective_area, too")
+        return self
 
     @model_validator(mode="after")
     def _one_way_to_torque(self) -> Signal:
@@ -252,6 +263,8 @@ class Vehicle(_Section):
                 out |= {key: given["value"]} if "value" in given else {}
                 if "value" not in given:
                     del out[key]
+                if "std" in given and std in out:
+                    raise ValueError(f"{key} = {{ value, std }} and {std} are the same: leave out one of the two")
                 if "std" in given:
                     out[std] = given["std"]
         return out
@@ -296,7 +309,7 @@ class Axle(_Section):
     motor_speed: Signal | None = None
     """Rotation of its motor [rad/s]: the mean of its wheels' speeds, where these have no sensor."""
     load: Signal | None = None
-    """Load on the axle [N]: load cell or pressure of the air springs."""
+    """Load on the axle [N]: load cell, or with `effective_area` the pressure of the air springs."""
 
 
 class Wheel(_Section):
@@ -304,6 +317,7 @@ class Wheel(_Section):
 
     `max_torque` [N m] is the motor's limit at the wheel where no signal reports it.  Only the
     wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
+    Of the wheels of an axle, the left one stands first.
     """
 
     name: Name
@@ -349,10 +363,15 @@ class Wheel(_Section):
 
     @model_validator(mode="after")
     def _can_be_used(self) -> Wheel:
-        of_motor = [role for role in ("torque", "torque_limit", "max_torque") if getattr(self, role) is not None]
-        if not self.driven and of_motor:
-            raise ValueError(f"wheel {self.name} has driven = false and a {of_motor[0]}: leave out one of the two")
+        _check_free(self, "wheel")
         return self
+
+
+def _check_free(part: Wheel | Track, section: str) -> None:
+    """ValueError for a wheel or track that rolls freely and has a motor's torque or limit."""
+    of_motor = [role for role in ("torque", "torque_limit", "max_torque") if getattr(part, role) is not None]
+    if not part.driven and of_motor:
+        raise ValueError(f"{section} {part.name} has driven = false and a {of_motor[0]}: leave out one of the two")
 
 
 class Track(_Section):
@@ -427,6 +446,7 @@ class Track(_Section):
             raise ValueError(f"track {self.name} needs sprocket_radius, or pitch and sprocket_teeth: one of the two")
         if self.roller_spacing is not None and self.roller_spacing > self.contact_length:
             raise ValueError(f"track {self.name}: roller_spacing is greater than contact_length")
+        _check_free(self, "track")
         return self
 
 
@@ -826,7 +846,7 @@ class Output(_Section):
 
     dbc: str = "soilbus.dbc"
     """Layout of our own frames."""
-    compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (5.0e4, 1.0e5, 2.0e5)
+    compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(default=(5.0e4, 1.0e5, 2.0e5), strict=False)
     """Bearing pressures [Pa] from which the soil counts as slightly compacted, compacted, very compacted: codes 2, 3, 4
     of DDI 470 in `replay --isoxml`.  A tyre presses on soft ground about as hard as it is inflated (Wong 2008, ch. 2):
     from 0.5, 1, 2 bar on the ground carries a tyre of that pressure with a rut of at most `estimator.z_ref`."""
@@ -923,13 +943,15 @@ class Config(_Section):
         """What follows for [vehicle] from tracks that carry all of it."""
         if not isinstance(value, Mapping) or value.get("wheel") or not isinstance(value.get("vehicle"), Mapping):
             return value
-        tracks = value.get("track")
-        track = tracks[0] if isinstance(tracks, list) and tracks else None
-        if not isinstance(track, Mapping) or "contact_length" not in track or "axle" in track:
+        given = value.get("track")
+        tracks = [t for t in (given if isinstance(given, list) else [given]) if isinstance(t, Mapping)]
+        if not tracks or all("axle" in track for track in tracks):
             return value
-        length = track["contact_length"]
-        middle = {"cg_ahead_of_rear_axle": length / 2.0} if isinstance(length, (int, float)) else {}
-        return {**value, "vehicle": {"wheelbase": length, "steering": "skid", **middle, **value["vehicle"]}}
+        lengths = [t["contact_length"] for t in tracks if type(t.get("contact_length")) in (int, float)]
+        usual = [float(length) for length in lengths if CONTACT_LENGTH.low <= length <= CONTACT_LENGTH.high]
+        length = usual[0] if usual else WHEELBASE.high  # then the fault is that of the track alone
+        defaults = {"wheelbase": length, "steering": "skid", "cg_ahead_of_rear_axle": length / 2.0}
+        return {**value, "vehicle": defaults | dict(value["vehicle"])}
 
     @model_validator(mode="after")
     def _tracks_as_wheels(self) -> Config:
@@ -959,7 +981,7 @@ class Config(_Section):
     def _consistent(self) -> Config:
         names = [w.name for w in self.wheel]
         for name in {n for n in names if names.count(n) > 1}:
-            raise ValueError(f"two wheels are named {name}")
+            raise ValueError(f"two {'tracks' if name in [t.name for t in self.track] else 'wheels'} are named {name}")
         if len(self.wheel) > 1 and self.vehicle is None:
             raise ValueError("several wheels need a [vehicle]")
         if self.table is not None and (self.vehicle is not None or len(self.wheel) != 1):
@@ -981,10 +1003,12 @@ class Config(_Section):
             wheels = [w for w in self.wheel if axle.name in ("both", w.axle)]
             if not wheels:
                 yield f"axle {axle.name} has no [[wheel]]"
+            of_motor = ("torque", "torque_limit", "max_torque", "motor_speed")
+            given = [role for role in of_motor if getattr(axle, role) is not None]
+            if wheels and given and not any(w.driven for w in wheels):
+                yield f"axle {axle.name} has a {given[0]}, but each of its wheels has driven = false"
             if axle.torque is None:
                 continue
-            if not any(w.driven for w in wheels):
-                yield f"axle {axle.name} has a torque, but each of its wheels has driven = false"
             own = [f"wheel.{w.name}" for w in wheels if w.torque is not None]
             own += [f"axle.{a.name}" for a in self.axle if axle.name == "both" != a.name and a.torque is not None]
             if own:

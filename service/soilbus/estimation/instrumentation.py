@@ -46,6 +46,9 @@ SIDE_SLOPE_SHARE = 0.06
 UNKNOWN_SIDE_SHARE = 0.4
 """The same for one instant of many: a side slope lasts for seconds, so that a window holds few independent ones;
 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
+UNKNOWN_SLOPE = 0.4
+"""Sd of a slope [rad] in one instant where no sensor shows it, and slopes alone take the pull: that of
+UNKNOWN_SIDE_SHARE, for the same reason."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
@@ -165,6 +168,12 @@ class Instrumentation:
             if np.array_equal(wheels["torque"][i], wheels["load"][k])
         )
 
+    @property
+    def without_speed(self) -> NDArray[np.bool_]:
+        """Which wheels (W,) have a speed that no channel measures, not even the mean of several."""
+        free = [row for row in self.speed if row.kind == "free"]
+        return np.array([any(row.weight[w] for row in free) for w in range(len(self.speed))])
+
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)
@@ -276,7 +285,8 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
     variance = dict(window.variance)
     if rig.towing == "never":
         changed["draft"] = np.zeros(len(window.t))
-        variance["draft"] = np.zeros(len(window.t))
+        weight = 0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY
+        variance["draft"] = np.where(_shows_slope(window, rig), 0.0, (UNKNOWN_SLOPE * weight) ** 2)
     if rig.specific_force and not window.kinematic:
         changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(window.pitch))
     if rig.chassis is not None and np.isfinite(window.steering_angle).any() and not np.isfinite(window.yaw_rate).any():
@@ -349,6 +359,11 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             )
             variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
     return _solved(given.load, load), scale, variance, by_inertia, by_draft
+
+
+def _shows_slope(window: Window, rig: Rig) -> NDArray[np.bool_]:
+    """At which instants (N,) a sensor feels the slope."""
+    return np.isfinite(window.pitch) | (np.isfinite(window.acceleration) & rig.specific_force)
 
 
 def _knows_inertia(window: Window, rig: Rig) -> NDArray[np.bool_]:

@@ -401,6 +401,8 @@ class Intake:
         ground = window.ground_speed[:, None]
         slip = slip_ratio(self.rig.radius, window.speed, ground)
         slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)
+        if self.rig.instrumentation is not None:
+            slip[:, self.rig.instrumentation.without_speed] = np.nan  # their speed is assumed
         return dict(zip(self.rig.wheels, column_means(slip), strict=True))
 
 

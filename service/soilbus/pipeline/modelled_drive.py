@@ -18,7 +18,7 @@ from soilbus.estimation.instrumentation import ROLLING_SLIP
 from soilbus.estimation.window import Rig, pairs
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.vehicle import axle_loads
+from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil, state_on
 
 GROUND_SPEED = 1.5
@@ -64,24 +64,28 @@ def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
     share[pairs(rig)] *= 1.0 + SIDE_LOAD_SHARE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]
     model = CompletedModel.of(model_of(config), effects_of(config), GROUND_SPEED)
     state = state_on(Soil(*(prior.value for prior in config.soil_prior.values())), np.nan, slip, radius, width, length)
-    draft, ratio = np.zeros(len(t)), np.ones(share.shape)
+    still = np.zeros(len(t))
+    draft, pitch, ratio = still, still, np.ones(share.shape)
     for _ in range(FIXED_POINT_ROUNDS):
-        of_front, of_rear = axle_loads(rig.chassis, draft, 0.0, 0.0)
+        of_front, of_rear = axle_loads(rig.chassis, draft, pitch, 0.0)
         load = np.where(rear, of_rear, of_front) * share
         state = state._replace(entry_angle=entry_angle_for_load(load * ratio, state, model.model))
         carried, pull, torque = model.forces(state, rear, load)
-        draft, ratio = pull.sum(axis=0), ratio * load / carried
+        ratio = ratio * load / carried
+        if rig.towing == "never":  # slopes take the pull
+            pitch = np.arcsin(np.clip(pull.sum(axis=0) / (rig.chassis.mass * GRAVITY), -1.0, 1.0))
+        else:
+            draft = pull.sum(axis=0)
         if not rig.drives.all():
             by_slip = (model.forces(state._replace(slip=state.slip + SLIP_STEP), rear, load)[2] - torque) / SLIP_STEP
             slip = np.where(rig.drives[:, None], slip, np.clip(slip - torque / by_slip, *ROLLING_SLIP_RANGE))
             state = state._replace(slip=slip)
     depth = model.sinkage(state.entry_angle, Wheel(radius, width, rear, load))
-    speed, still = GROUND_SPEED / (radius * (1.0 - slip)), np.zeros(len(t))
-    if rig.towing == "never":
-        draft = still
+    speed = GROUND_SPEED / (radius * (1.0 - slip))
+    acceleration = GRAVITY * np.sin(pitch) if rig.specific_force else still
     return {
         "torque": torque, "torque_limit": np.full_like(torque, 2.0 * torque.max()), "load": carried,
         "speed": speed, "motor_speed": speed, "sinkage": depth,
-        "ground_speed": np.full(len(t), GROUND_SPEED), "draft": draft, "pitch": still, "acceleration": still,
+        "ground_speed": np.full(len(t), GROUND_SPEED), "draft": draft, "pitch": pitch, "acceleration": acceleration,
         "yaw_rate": still, "roll": still, "steering_angle": still, "differential_lock": still,
     }  # fmt: skip

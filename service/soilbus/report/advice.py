@@ -90,7 +90,9 @@ def _moved(windows: Sequence[WindowResult], only: str = "") -> str:
 
 
 def _draft(windows: Sequence[WindowResult]) -> _Spread | None:
-    return _typical([(w.excitation.draft, w.excitation.draft_sd) for w in windows])
+    """Of what is towed; None where nothing ever is, which counts as a draft of 0 all along."""
+    drafts = [(w.excitation.draft, w.excitation.draft_sd) for w in windows]
+    return None if all(draft == (0.0, 0.0) for draft in drafts) else _typical(drafts)
 
 
 def _slip(windows: Sequence[WindowResult]) -> _Spread | None:

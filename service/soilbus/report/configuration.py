@@ -16,7 +16,7 @@ from cantools.database.can import Database
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
-from soilbus.can.mapping import SHARED_ROLES, channels_of, without_unit
+from soilbus.can.mapping import AXLE_ROLES, SHARED_ROLES, WHEEL_ROLES, channels_of, without_unit
 from soilbus.config.model import Config, Form, Signal, Table
 from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
@@ -68,6 +68,7 @@ def configuration_warnings(config: Config) -> list[str]:
         lines.append("no wheel has torque, speed and load mapped: nothing can be estimated")
     elif config.table is None and config.signals.ground_speed is None:
         lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
+    lines += _lines_of_vehicle(config)
     for role in SHARED_ROLES:
         for wheels in config.same_signal(role):
             if len(wheels) > 1:
@@ -88,6 +89,37 @@ def configuration_warnings(config: Config) -> list[str]:
     return lines
 
 
+def _lines_of_vehicle(config: Config) -> Iterator[str]:
+    """A line for each key of the vehicle that contradicts what is mapped, or that nothing uses."""
+    if config.vehicle is None or config.table is not None:
+        return
+    if config.vehicle.towing == "measured" and config.signals.draft is None:
+        yield (
+            'signals.draft is not mapped, and vehicle.towing is not "never": the draft is unknown, so there is no GO,'
+            " only what could be pulled"
+        )
+    if config.vehicle.towing == "unknown" and config.signals.draft is not None:
+        yield 'vehicle.towing = "unknown", but signals.draft is mapped and counts: "measured" is meant'
+    felt = config.signals.acceleration
+    if config.signals.pitch is None and (felt is None or felt.kind == "kinematic"):
+        yield (
+            'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
+            " and each per cent of slope as a draft of one per cent of the weight"
+        )
+    if config.vehicle.steering == "skid" and not (config.vehicle.track or config.signals.yaw_rate):
+        yield (
+            'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: how far the wheels slide'
+            " sideways in a turn is not known"
+        )
+    for wheel in config.wheel:
+        at_motor = (getattr(wheel, role) for role in WHEEL_ROLES)
+        if wheel.gear_ratio != 1.0 and not any(at_motor):
+            yield (
+                f"{wheel.section}.{wheel.name}.gear_ratio = {wheel.gear_ratio:g} concerns no signal of it; that of the"
+                f" axle's motor is axle.{wheel.axle}.gear_ratio"
+            )
+
+
 SAMPLES_PER_SECOND = 50.0
 """Of each channel, where the DBC does not say otherwise: frames every 20 ms."""
 MIN_COHESION = 70.0
@@ -102,7 +134,10 @@ def _measured(config: Config) -> Iterator[str]:
         return
     for quantity in type(config.noise).model_fields:
         wheels = any(getattr(wheel, quantity, None) is not None for wheel in config.wheel)
-        if wheels or getattr(config.signals, quantity, None) is not None:
+        axles = any(
+            getattr(a, role) is not None for a in config.axle for role in AXLE_ROLES if AXLE_ROLES[role] == quantity
+        )
+        if wheels or axles or getattr(config.signals, quantity, None) is not None:
             yield quantity
 
 
@@ -150,11 +185,21 @@ def defaults_text(config: Config) -> str:
         if isinstance(value, Mapping):
             for k, v in value.items():
                 walk(f"{prefix}.{k}" if prefix else k, v)
+        elif prefix in ("axle", "wheel", "track"):
+            for part in value:
+                walk(f"{prefix}.{part['name']}", {k: v for k, v in part.items() if k not in _LISTED})
         else:
             lines.append(f"{prefix} = {value}")
 
-    walk("", config.model_dump(exclude={"wheel", "track", "signals", "folder"}))
+    whole = config.model_dump(exclude={"signals", "folder"})
+    tracks = {track["name"] for track in whole["track"]}
+    whole["wheel"] = [wheel for wheel in whole["wheel"] if wheel["name"] not in tracks]
+    walk("", whole)
     return "\n".join(lines)
+
+
+_LISTED = {"name", *WHEEL_ROLES, *AXLE_ROLES}
+"""Keys of a wheel, track or axle that say nothing beside the table of signals."""
 
 
 def load_lines(config: Config) -> list[str]:
@@ -165,25 +210,44 @@ def load_lines(config: Config) -> list[str]:
         return []
     wheels = [wheel.model_copy(update={"load": wheel.load or Signal(signal="A.Cell")}) for wheel in config.wheel]
     own, with_cells = _expected(config), _expected(config.model_copy(update={"wheel": wheels}))
-    without = [rig.wheels[i] for i in np.flatnonzero(given.computes("load"))]
-    line = (
-        f"No load cell at {', '.join(without)}: the load follows from mass, centre of gravity, pitch, acceleration and"
-        f" draft, and in a single instant is hardly known (noise.computed_load)."
-    )
+    shared = [[rig.wheels[i] for i in np.flatnonzero(row.weight)] for row in given.load if row.kind == "channel"]
+    of_sums = {wheel for wheels in shared for wheel in wheels if len(wheels) > 1}
+    without = [rig.wheels[i] for i in np.flatnonzero(given.computes("load")) if rig.wheels[i] not in of_sums]
+    lines = [
+        f"{' and '.join(wheels)} are weighed together: what each carries follows from roll and their torques."
+        for wheels in shared
+        if len(wheels) > 1
+    ]
+    if without:
+        lines.append(
+            f"No load cell at {', '.join(without)}: the load follows from mass, centre of gravity, pitch, acceleration"
+            " and draft, and in a single instant is hardly known (noise.computed_load)."
+        )
     if own is None or with_cells is None:
-        return [line]
-    limit = config.estimator.max_bearing_std
+        return lines
+    limit, load = config.estimator.max_bearing_std, "slope" if rig.towing == "never" else "draft"
     too_wide = [
         f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std) count as not excited, and"
-        " there is no GO; without load cells set it to 0.2."
+        f" there is no GO; {_way_out(own[0], limit)}."
     ]
     return [
-        line,
-        f"After {config.estimator.window:g} s of varied draft on the soil assumed below, bearing pressure is known to"
+        *lines,
+        f"After {config.estimator.window:g} s of varied {load} on the soil assumed below, bearing pressure is known to"
         f" {own[0]:.1%} (with load cells to {with_cells[0]:.1%}), tan phi to {own[1]:.1%} ({with_cells[1]:.1%}), as far"
         " as the sensors go; what the form of the contact leaves open comes on top.",
         *(too_wide if own[0] > limit else []),
     ]
+
+
+def _way_out(std: float, limit: float) -> str:
+    """What the configuration can do about a bearing pressure that is known to no better than the limit."""
+    if limit < std <= USUAL_LIMIT:
+        return f"without load cells set it to {USUAL_LIMIT:g}"
+    return "what is known of the soil, in [soil], narrows it"
+
+
+USUAL_LIMIT = 0.2
+"""`estimator.max_bearing_std` as `init` writes it for machines without load cells."""
 
 
 def _expected(config: Config) -> tuple[float, float] | None:
@@ -254,7 +318,7 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
         channel.name,
         f"{channel.message}.{channel.signal}",
         signal.unit or "-",
-        f"{channel.factor:g}",
+        f"{channel.factor:g}" + (f", + {channel.offset:g}" if channel.offset else ""),
         f"{channel.low:.4g} .. {channel.high:.4g}",
         every,
         status,

@@ -253,6 +253,12 @@ class Dashboard:
             return "no status of soilbus", MEASURING
         if known.value("SoilbusStatus", "State") == "starting":
             return "soilbus is starting", MEASURING
+        if (
+            reason not in REASONS
+            and not known.is_stale("PresentDemand")
+            and known.number("PresentDemand", "Draft") is None
+        ):
+            return "no sensor shows the draft", "Go carefully"
         return REASONS.get(reason, ("the estimate is too old", MEASURING))
 
     def _watch_for_inputs(self) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from soilbus.decision.traversability import Status
+from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
@@ -61,6 +61,9 @@ def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, re
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
+    could_pull = [r for r in good if r.traversability.max_draft is not None]
+    if any(r.traversability.state is State.UNKNOWN and r.excitation.draft is None for r in could_pull):
+        lines.append("        no sensor shows the draft: no go, only what could be pulled (vehicle.towing)")
     lines.append("failed solves " + counted(Counter(r.failure for r in results if r.failure)))
     lines.append("solver ended by " + counted(Counter(r.termination for r in results if r.termination)))
     if ended := sum(r.search_ended for r in results):

@@ -67,6 +67,9 @@ class Limits:
     """The same for one axle: centre of gravity and hitch height are known to this accuracy."""
     gear: float = 0.03
     """Relative difference of motor and wheel speed, due to resolution and phase; any other gear step is larger."""
+    locked: float = 0.015
+    """Median difference of two wheel speeds over their mean, from which no shaft connects them: each sensor's noise and
+    gain error are 0.003 and 0.002 (`noise.speed`); behind an open differential a simulated drive on loam has 0.06."""
     pushed: float = -0.2
     """Least median slip of driving wheels."""
     never_less: float = 0.45
@@ -442,7 +445,10 @@ def _compared(
         ]
     findings: list[Finding] = []
     questions: list[str] = []
-    for check in (_weight, _directions, _gears, _axle_gears, _free_wheels, _slips, _balance, _levels, _sides, _yaw):
+    checks = (
+        _weight, _directions, _gears, _axle_gears, _locked, _free_wheels, _slips, _balance, _levels, _sides, _yaw,
+    )  # fmt: skip
+    for check in checks:
         try:
             found = list(check(facts, limits))
         except UndecidableError as reason:
@@ -584,6 +590,24 @@ def _axle_gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
                 " order of one of the speeds?",
                 True,
                 channels,
+            )
+
+
+def _locked(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Speeds left and right behind a locked differential."""
+    for axle in facts.config.axle:
+        own = [w for w in facts.config.wheel if w.axle == axle.name and w.driven and w.speed is not None]
+        if axle.differential != "locked" or len(own) != 2:
+            continue
+        one, other = (facts.raw.speed[:, facts.rig.wheels.index(w.name)] for w in own)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            apart = median(np.abs(one / other - 1.0)[facts.straight])
+        if apart > limits.locked:
+            yield Finding(
+                f'axle.{axle.name}.differential = "locked", but the speeds of {own[0].name} and {own[1].name} differ by'
+                f' {apart:.1%} straight on: "open" or "limited"?',
+                True,
+                tuple(f"speed.{w.name}" for w in own),
             )
 
 

@@ -11,7 +11,7 @@ for a drive from config [noise]. Quantisation comes with the frames (simulator/f
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -205,6 +205,26 @@ def true_speed(true_columns: Mapping[str, NDArray[Any]], config: Config, part: s
     return _true_reading(true_columns, "speed", weight)
 
 
+def true_readings(true_columns: Mapping[str, NDArray[Any]], config: Config, names: Iterable[str]) -> dict[str, Array]:
+    """What the sensors of these channels read without errors and effects (N,), from the true columns of a drive."""
+    columns = dict(true_columns) | _straight_on(true_columns, config)
+    of_channel = {sensor.name: sensor for sensor in sensors(config)}
+    quantity = {name: of_channel[name].quantity for name in names}
+    return {
+        name: _true_reading(columns, _MEASURED_QUANTITY.get(of, of), of_channel[name].weight)
+        for name, of in quantity.items()
+    }
+
+
+def _straight_on(true_columns: Mapping[str, NDArray[Any]], config: Config) -> dict[str, NDArray[Any]]:
+    """Acceleration (N,) as its sensor feels it, and what is zero on a straight way."""
+    felt = dict.fromkeys(("yaw_rate", "steering_angle", LOCK), np.zeros(len(true_columns["t"])))
+    mapped = config.signals.acceleration
+    if mapped is not None and mapped.kind == "specific_force":
+        felt["acceleration"] = true_columns["acceleration"] + GRAVITY * np.sin(true_columns["pitch"])
+    return felt
+
+
 def _true_reading(true_columns: Mapping[str, NDArray[Any]], quantity: str, weight: Mapping[str, float]) -> Array:
     """What a sensor without errors reads (N,)."""
     if not weight:
@@ -225,10 +245,7 @@ def _with_sensor_effects(drive: Drive, config: Config) -> dict[str, NDArray[Any]
             load = load + effect.load(around, values)
         if effect.draft is not None:
             draft = draft + np.ravel(effect.draft(drive.columns["draft"], around, values))
-    changed = {"draft": draft} | dict.fromkeys(("yaw_rate", "steering_angle", LOCK), np.zeros(len(draft)))
-    mapped = config.signals.acceleration
-    if mapped is not None and mapped.kind == "specific_force":
-        changed["acceleration"] = drive.columns["acceleration"] + GRAVITY * np.sin(drive.columns["pitch"])
+    changed = {"draft": draft} | _straight_on(drive.columns, config)
     for i, wheel in enumerate(wheels):
         changed |= {f"torque.{wheel}": torque[:, i], f"load.{wheel}": load[:, i]}
     return changed | _late(drive, drive.columns | changed, wheels)

@@ -38,6 +38,7 @@ from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.sensors import true_readings
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 from soilbus.validation.bayes_risk_bound import BayesRisk, bayes_risk
@@ -323,9 +324,10 @@ def problem_of(
     """The window of these channels as measured, or as it truly was at the times of the samples."""
     rig, truth = rig_of(config), recording.truth
     columns = {name: recording.channels[name] for name in names}
+    readings = true_readings(truth, config, columns) if of_truth else {}
     store = Bins(rig, config.estimator.bin, 0.0)
     store.add({
-        name: (column.t, np.interp(column.t, truth["t"], truth[name]) if of_truth else column.value)
+        name: (column.t, np.interp(column.t, truth["t"], readings[name]) if of_truth else column.value)
         for name, column in columns.items()
     })  # fmt: skip
     window, settings = store.window(0.0, duration), config.estimator
