@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
+from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
 from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import Rig, Window, window_of_samples
@@ -14,6 +15,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on, wheel_forces
+from soilbus.validation import computed_loads
 
 MODEL = WheelModel()
 PARAMETERS = Soil._fields
@@ -220,3 +222,15 @@ def test_rows_that_one_latent_swamps_have_a_finite_inverse():
     inverse = inverse_covariance(A, np.full((1, 9), 0.05**2), np.full((1, 5), 25.0))
     assert np.isfinite(inverse).all()
     assert (np.linalg.eigvalsh(inverse[0]) > -1e-20).all()
+
+
+@pytest.mark.parametrize("seed", [390794349, 1373557564, 2444203465, 3971769130])
+def test_a_fit_behind_an_open_differential_converges_where_loads_shake(seed):
+    # Side loads follow from equal torques.  Where their noise is not in the weights and they are not in the Jacobian,
+    # -2 log posterior rises along the step and the descent ends at its limit.
+    task = computed_loads.Task("tractor-2wd", "axle cells", "loam", 0.12, seed)
+    problem, prior = computed_loads.window_of(task)
+    fit = fit_window(problem, prior)
+    assert fit.converged
+    pressure, true = fit.mode.posterior.bearing_pressure(0.1, 0.3), SOILS["loam"].bearing_pressure(0.1, 0.3)
+    assert abs(np.log(pressure.value / true)) < 2.5 * pressure.std / pressure.value

@@ -49,6 +49,9 @@ UNKNOWN_SIDE_SHARE = 0.4
 UNKNOWN_SLOPE = 0.4
 """Sd of a slope [rad] in one instant where no sensor shows it, and slopes alone take the pull: that of
 UNKNOWN_SIDE_SHARE, for the same reason."""
+MAX_EQUAL_BIAS = 0.12
+"""Bias of a differential below which its torques, taken for equal, tell how the load lies left and right: what loads
+shake by (rms over themselves, of the field vehicle).  Behind limited slip they tell less."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
@@ -165,6 +168,7 @@ class Instrumentation:
             for i, torque in enumerate(self.torque)
             for k, load in enumerate(self.load)
             if torque.kind == "coupling" and load.kind == "side"
+            if self.couplings[torque.at].bias < MAX_EQUAL_BIAS
             if np.array_equal(wheels["torque"][i], wheels["load"][k])
         )
 

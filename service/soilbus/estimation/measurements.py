@@ -47,9 +47,10 @@ _BY_INSTANT = (
     "inertia", "inertia_var", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
     "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
+    "_side_known",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
-_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve", "_side_known")
+_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
 """The same of those that may be None."""
 
 
@@ -127,6 +128,9 @@ class Measurements:
             self.torque, self.torque_var = np.where(known, torque, 0.0), np.where(known, torque_var, 0.0)
             usable = (~usable).astype(float) @ (np.abs(self._torque_matrix) > 0.0).T == 0.0
         self.has_torque = known & usable
+        torques, self._side_columns = [torque for torque, _ in self._sides], [load for _, load in self._sides]
+        self._side_known = self.has_torque[:, torques]
+        self.has_torque[:, torques] = False
         usable = self.usable
         self.sinkage, self.sinkage_var, known = take("sinkage")
         self.has_sinkage = known & usable
@@ -160,6 +164,7 @@ class Measurements:
             known = np.isfinite(value) & np.isfinite(variance)
             self._measured = np.where(known, value, 1.0)
             self._measured_var = np.where(known & ~self._of_free_wheels(), variance, 0.0)
+            self._measured_var[:, self._side_columns] *= ~self._side_known
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
         known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
@@ -171,38 +176,20 @@ class Measurements:
         self.held_covariance: Array | None = None
         self.common_weights: Array | None = None
         self._off_curve: Array | None = None
-        self._side_known: NDArray[np.bool_] | None = None
-        self._side_columns: list[int] = []
         self._count()
 
     def on_curves(self) -> Self:
-        """The same with latents on smooth curves of what is measured, and side loads by equal torques.
+        """The same with latents on smooth curves of what is measured, where two wheels share a torque.
 
         Latents at their conditional optimum are uncorrelated with the residuals if these are weighed by their true
         covariance.  Computed loads leave more open than they vary by, so the assumed one is several times too large:
         the latents keep their sensors' noise, and the Jacobian taken there correlates with the residuals.  On the
         channels' smooth curves it does not (regression calibration: Carroll et al. 2006, Measurement Error in Nonlinear
         Models, ch. 4).
-
-        Wheels with equal torques behind an open differential slip by their loads.  Where nothing measures the loads
-        left and right, T_left(W_left) = T_right(W_right) fixes their difference, as T = 0 fixes the slip of a free
-        wheel: that row is used up.  Held equal, an effect of slip would seem to explain what the loads do.
-
-        The same where no two wheels share a torque, or their loads are measured.
         """
         if not self.computes_sides:
             return self
         smooth = copy(self)
-        smooth.has_torque, smooth._known, smooth._measured_var = (
-            a.copy() for a in (self.has_torque, self._known, self._measured_var)
-        )
-        smooth._side_known = self.has_torque[:, [torque for torque, _ in self._sides]]
-        smooth._side_columns = [load for _, load in self._sides]
-        for torque, load in self._sides:
-            smooth.has_torque[:, torque] = smooth._known[:, torque] = False
-            smooth._measured_var[self.has_torque[:, torque], load] = 0.0
-        smooth._row_var = np.where(smooth._known, self._row_var, 1.0)
-        smooth._count()
         noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
         of_draft, of_inertia = (
             off_curve(self.t, *column)[:, None]

@@ -18,8 +18,9 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
 (`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
 two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
-pull are curved in the load, so that unequal loads held equal bias the soil.  Behind a differential no torque says so;
-a diagnosis, which compares models over minutes, takes it from equal torques and unequal slips (`on_curves`).
+pull are curved in the load, so that unequal loads held equal bias the soil.  Behind an open differential equal torques
+and unequal slips say how they differ: T_left(W_left) = T_right(W_right) fixes the difference, as T = 0 fixes the slip
+of a free wheel, and that row is used up.
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
@@ -167,6 +168,7 @@ class Linearisation:
     load_by_effects: Array  # (P, N, W)
     rolling_slip: Array  # (N, F) slips of the free wheels after a Newton step
     side_load: Array  # (N, S) loads left less right behind differentials after a Newton step
+    by_sides: Array  # (N, S, m) derivatives of the rows by those of equal torques, which are used up for these loads
 
     @property
     def chi2(self) -> float:
@@ -362,6 +364,9 @@ class ObservationModel(Measurements):
         side_load = self._side_load(A, at.value[1], now)
         corrected[:, self._side_columns] = now[:, self._side_columns]
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
+        by_sides = self._by_sides(A)
+        for values in (rows, A):
+            self._without_sides(values, by_sides)
         if delay is not None:
             corrected = corrected + delay.measured * of_latents
         if self._missing is not None:
@@ -394,6 +399,7 @@ class ObservationModel(Measurements):
             load_by_effects=at.load_by_effects,
             rolling_slip=rolling_slip,
             side_load=side_load,
+            by_sides=by_sides,
         )
 
     def denoised(self, optimum: Optimum) -> tuple[Self, Latents]:
@@ -523,14 +529,12 @@ class ObservationModel(Measurements):
         return noise
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
-        """Observations (N, S) of loads left less right after a Newton step to equal torques; see `on_curves`.
+        """Observations (N, S) of loads left less right after a Newton step to equal torques.
 
         A: derivatives of the residuals by the observations; torque: of the wheels (N, W) [N m]; now: observations of
         the latents, in which equal loads are the axle's load.
         """
         found = now[:, self._side_columns]
-        if self._side_known is None:
-            return found
         off, most = self.torque_rows(torque), self.options.measurements.max_side_load
         for s, (row, column) in enumerate(self._sides):
             axle, slope = self._measured[:, column], -A[:, row, column]
@@ -538,6 +542,23 @@ class ObservationModel(Measurements):
             found[:, s] += step * self._side_known[:, s]
             found[:, s] = np.clip(found[:, s], (1.0 - most) * axle, (1.0 + most) * axle)
         return found
+
+    def _by_sides(self, A: Array) -> Array:
+        """Derivatives (N, S, m) of the residuals by those of equal torques, through the side loads; A (N, m, 2 W + 1).
+
+        With r_e the residual of equal torques of two wheels and x their side load, r_e + (dr_e/dx) dx = 0 takes x out
+        of every other row: r <- r - (dr/dx) / (dr_e/dx) r_e, and so of its derivatives (`_without_sides`).
+        """
+        by_sides = np.zeros((self.n, len(self._sides), A.shape[1]))
+        for s, (row, column) in enumerate(self._sides):
+            slope = np.where(self._side_known[:, s] & (A[:, row, column] != 0.0), A[:, row, column], np.inf)
+            by_sides[:, s] = A[:, :, column] / slope[:, None]
+        return by_sides
+
+    def _without_sides(self, values: Array, by_sides: Array) -> None:
+        """Take the side loads out of values (N, m, ...) of the rows, in place."""
+        for s, (row, _) in enumerate(self._sides):
+            values -= by_sides[:, s, :, None] * values[:, row][:, None, :]
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
         """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
@@ -776,6 +797,7 @@ class ObservationModel(Measurements):
         rows[:, layout.balance] = -pull.sum(2).T
         if self.with_sinkage:
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
+        self._without_sides(rows, at.by_sides)
         rows[~self._known] = 0.0
         variance, row_var = self._corrected(gains)[5:]
         weighed = self.inverse_covariance(at.by_latents, variance, row_var) @ rows

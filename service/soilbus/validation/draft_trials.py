@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,14 +25,15 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.estimation.window import Rig, pairs
 from soilbus.sensors.bins import Bins
+from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
-from soilbus.simulator.recording import simulate
+from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.validation.monte_carlo import Each, prior_about
+from soilbus.validation.monte_carlo import MAX_SOIL_DRAWS, Each, prior_about
 from soilbus.validation.windows import torque_limits
 
 __all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
@@ -113,11 +115,8 @@ def draft_trials(
 def trial(task: Task) -> DraftTrial:
     """Simulate one drive, estimate, predict, and solve for the true draft."""
     config, name, seed = task
-    rng = np.random.default_rng([seed, 2])
-    soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
-    slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+    soil, recording = _driven(task)
     duration = config.estimator.window
-    recording = simulate(config, Scenario(duration, (Patch(0.0, name, soil),), slip=slip), seed)
     rig, model, settings = rig_of(config), model_of(config), config.traversability
     store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
@@ -135,6 +134,19 @@ def trial(task: Task) -> DraftTrial:
     if able is None:
         return DraftTrial(name, np.nan, np.nan, truth)
     return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
+
+
+def _driven(task: Task) -> tuple[Soil, Recording]:
+    """The first soil drawn about the named one on which the vehicle gets on, and the drive over it."""
+    config, name, seed = task
+    rng = np.random.default_rng([seed, 2])
+    for _ in range(MAX_SOIL_DRAWS):
+        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
+        slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+        scenario = Scenario(config.estimator.window, (Patch(0.0, name, soil),), slip=slip)
+        with suppress(SimulationError):
+            return soil, simulate(config, scenario, seed)
+    raise SimulationError(f"the tractor cannot drive on {name}: no slip lets it move on {MAX_SOIL_DRAWS} soils like it")
 
 
 def true_largest_draft(
