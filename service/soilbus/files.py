@@ -1,8 +1,6 @@
-"""Reading a file that a user names, whatever it turns out to be: a device without end, a pipe, a folder.
+"""Files that a user names, read whatever they turn out to be, and outputs that are there whole or not at all.
 
-Files that are there whole or not at all, even when the process that writes them is killed.
-
-Output files that are there whole or not at all.
+What is read may be a device without end, a pipe, a folder; what is written stays whole even when its process is killed.
 """
 
 from __future__ import annotations

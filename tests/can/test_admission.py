@@ -208,6 +208,17 @@ def test_checksum_and_counter() -> None:
     assert refused(a.take()) == {("Value", "bad_counter"): [6.0]}
 
 
+def test_frames_that_a_counter_skips_are_counted_across_batches_and_its_turn() -> None:
+    a = admission(LEFT, ("Guarded", "Value"), checked=["Guarded"])
+    for t, counter in ((0.0, 12), (0.1, 13), (0.2, 15), (0.5, 2)):  # 14 never came; 0 and 1 neither
+        a.feed(t, 257, False, guarded(5, counter))
+    a.take()
+    a.feed(0.6, 257, False, guarded(5, 6))  # 3, 4, 5 neither
+    a.take()
+    assert a.missed == 6
+    assert admission(LEFT).missed is None  # nothing counts there: not 0
+
+
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.integers(0, 31))
 def test_any_flipped_bit_of_a_guarded_frame_is_refused(bit: int) -> None:

@@ -142,6 +142,12 @@ class Admission:
         """The latest stamp [s] that is believed; minus infinity before the first."""
         return self._earliest + OUT_OF_ORDER if math.isfinite(self._earliest) else -math.inf
 
+    @property
+    def missed(self) -> int | None:
+        """Frames that the counters of checked messages skip (`Inbox.missed`); None where no message is checked."""
+        checked = [inbox.missed for inbox in self._inboxes if inbox.checksum_byte is not None]
+        return sum(checked) if checked else None
+
     def cut_short(self, arbitration_id: int, extended: bool, data: Data) -> Message | None:
         """The mapped message of a frame with less data than the DBC says, where others of it were whole."""
         inbox = self._by_key.get(_key(arbitration_id, extended))

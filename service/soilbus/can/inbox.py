@@ -68,6 +68,8 @@ class Inbox:
     last_id: int = -1
     last_counter: int = -1
     last_frame: tuple[float, int, bytes] = _NO_FRAME
+    missed: int = 0
+    """Frames that the counters of a checked message skip: lost, or refused for their checksum."""
 
     def forget(self) -> None:
         """As if no frame had ever come."""
@@ -142,18 +144,21 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where a frame repeats the counter of the one before it from the same sender; None where none does."""
+    """False where a frame repeats the counter of the one before it from the same sender; None where none does.
+
+    What the counters skip is counted in `inbox.missed`.
+    """
     if inbox.checksum_byte is None:
         return None
-    counter = inbox.decoder.columns_of(batch.blocks(inbox.decoder))[COUNTER].raw
-    last_counter, last_id = inbox.last_counter, inbox.last_id
+    column = inbox.decoder.columns_of(batch.blocks(inbox.decoder))[COUNTER]
+    counter = column.raw.astype(np.int64)
+    modulus = 1 << inbox.message.get_signal_by_name(COUNTER).length
+    step = np.diff(counter, prepend=inbox.last_counter) % modulus
+    follows = np.diff(batch.ids, prepend=inbox.last_id) == 0
     inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
-    if counter[0] != last_counter and np.count_nonzero(counter[1:] == counter[:-1]) == 0:
-        return None
-    before = np.concatenate(([last_counter], counter[:-1]))
-    id_before = np.concatenate(([last_id], batch.ids[:-1]))
-    moved: Mask = (counter != before) | (batch.ids != id_before)
-    return moved
+    inbox.missed += int(np.maximum(step - 1, 0)[follows].sum())
+    moved: Mask = (step != 0) | ~follows
+    return None if moved.all() else moved
 
 
 def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:

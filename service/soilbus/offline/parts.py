@@ -362,7 +362,7 @@ class _Summary:
 
     def record(self, pipeline: Pipeline | None, fault: str | None) -> dict[str, Any]:
         """The whole log in one row, with the names of its windows' columns."""
-        frames: dict[str, int] = {}
+        frames: dict[str, int | None] = {}
         used, rejected = None, self._rejected
         if pipeline is not None:
             counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
@@ -370,6 +370,7 @@ class _Summary:
                 "frames.mapped": sum(counts.received.values()),
                 "frames.unknown": counts.unknown,
                 "frames.error": counts.error_frames,
+                "frames.lost": pipeline.admission.missed,
             }
             used, rejected = refusals.used, refusals.total
         n = len(self._bearing)
