@@ -511,15 +511,8 @@ class ObservationModel(Measurements):
         return float(at.chi2 - missed - np.count_nonzero(~self._known))
 
     def noise_of_fitted(self, optimum: Optimum) -> Array:
-        """Variance (N, 2 W + 1) of the noise in the latents of an optimum.
-
-        Measured ones have V; where torques say more, V - V A' S^-1 A V.  A computed load has the noise of the draft and
-        the inertia that it is computed from, and V is how far it may be from the true one.
-        """
+        """Variance (N, 2 W + 1) of the noise in latents: V as measured; V - V A' S^-1 A V where torques say more."""
         A, noise, fitted = optimum.at.by_latents, optimum.at.variance, self._by_torques
-        if self.computes_loads:
-            of_demand = self.by_draft**2 * self.draft_var[:, None] + self.by_inertia**2 * self.inertia_var[:, None]
-            noise = np.where(self._prior_only, of_demand, noise)
         if not fitted.any():
             return noise
         by, prior = A[:, :, fitted], noise[:, fitted]

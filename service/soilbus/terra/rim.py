@@ -104,17 +104,15 @@ def _turning_angle(entry: Array, slip: Array, exit_ratio: Any) -> Array:
     def displacement(angle: Array) -> Array:
         return np.asarray(entry - angle - carry * (np.sin(entry) - np.sin(angle)))
 
-    # The displacement rises where carry cos(angle) > 1, convex below an angle of zero and concave above it: Newton from
-    # there, or from the exit angle above it, does not pass the zero.
-    exit_angle = exit_ratio * entry
-    has_zero = (carry * np.cos(entry) < 1.0) & (displacement(exit_angle) < 0.0)
-    angle = np.where(has_zero, np.maximum(exit_angle, 0.0), np.nan)
+    # The displacement peaks where carry cos(angle) = 1 and is zero once behind that.
+    high = np.where(carry * np.cos(entry) < 1.0, np.arccos(np.minimum(1.0 / carry, 1.0)), np.nan)
+    low = exit_ratio * entry
+    high = np.where(displacement(low) < 0.0, high, np.nan)
     for _ in range(50):
-        step = displacement(angle) / np.maximum(carry * np.cos(angle) - 1.0, 1e-300)
-        angle -= step
-        if not (np.abs(step) > 1e-10).any():
-            break
-    return np.asarray(angle)
+        middle = (low + high) / 2.0
+        negative = displacement(middle) < 0.0
+        low, high = np.where(negative, middle, low), np.where(negative, high, middle)
+    return np.asarray((low + high) / 2.0)
 
 
 def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:
