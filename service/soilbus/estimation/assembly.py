@@ -223,13 +223,13 @@ def _couplings(
         bias = DIFFERENTIAL_BIAS[kind] if axle is None or axle.torque_bias is None else axle.torque_bias
         for one, other in pairwise(wheels):
             rigid = any({one, other} <= wheels_together for wheels_together in together)
-            yield Coupling((one,), (other,), bias, kind == "locked" or rigid)
+            yield Coupling((one,), (other,), bias, kind == "locked" or rigid, kind == "open")
     centre = config.axle_named("both")
     front, rear = (tuple(i for i in of_axle[name] if drives[i]) for name in ("front", "rear"))
     if front and rear:
         kind = "locked" if centre is None else centre.differential
         bias = DIFFERENTIAL_BIAS[kind] if centre is None or centre.torque_bias is None else centre.torque_bias
-        yield Coupling(front, rear, bias, kind == "locked", of_axle=False)
+        yield Coupling(front, rear, bias, kind == "locked", kind == "open", of_axle=False)
 
 
 def _torque_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array) -> list[Row]:

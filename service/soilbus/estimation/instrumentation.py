@@ -46,12 +46,6 @@ SIDE_SLOPE_SHARE = 0.06
 UNKNOWN_SIDE_SHARE = 0.4
 """The same for one instant of many: a side slope lasts for seconds, so that a window holds few independent ones;
 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
-UNKNOWN_SLOPE = 0.4
-"""Sd of a slope [rad] in one instant where no sensor shows it, and slopes alone take the pull: that of
-UNKNOWN_SIDE_SHARE, for the same reason."""
-MAX_EQUAL_BIAS = 0.12
-"""Bias of a differential below which its torques, taken for equal, tell how the load lies left and right: what loads
-shake by (rms over themselves, of the field vehicle).  Behind limited slip they tell less."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
@@ -71,13 +65,14 @@ class Coupling(NamedTuple):
     """Two sets of wheels behind a differential; ratio (W,): turns of the shaft before it for one of the wheel.
 
     bias: sd of the difference of the torques over their sum; locked: the speeds are equal, and the torques differ by
-    anything; of_axle: the vehicle's differential lock acts on it.
+    anything; is_open: the torques are equal but for friction; of_axle: the vehicle's differential lock acts on it.
     """
 
     one: tuple[int, ...]
     other: tuple[int, ...]
     bias: float
     locked: bool
+    is_open: bool
     of_axle: bool = True
 
 
@@ -168,7 +163,7 @@ class Instrumentation:
             for i, torque in enumerate(self.torque)
             for k, load in enumerate(self.load)
             if torque.kind == "coupling" and load.kind == "side"
-            if self.couplings[torque.at].bias < MAX_EQUAL_BIAS
+            if self.couplings[torque.at].is_open
             if np.array_equal(wheels["torque"][i], wheels["load"][k])
         )
 
@@ -290,7 +285,8 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
     if rig.towing == "never":
         changed["draft"] = np.zeros(len(window.t))
         weight = 0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY
-        variance["draft"] = np.where(_shows_slope(window, rig), 0.0, (UNKNOWN_SLOPE * weight) ** 2)
+        slope = rig.options.measurements.unknown_slope
+        variance["draft"] = np.where(_shows_slope(window, rig), 0.0, (slope * weight) ** 2)
     if rig.specific_force and not window.kinematic:
         changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(window.pitch))
     if rig.chassis is not None and np.isfinite(window.steering_angle).any() and not np.isfinite(window.yaw_rate).any():

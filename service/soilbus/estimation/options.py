@@ -29,6 +29,9 @@ class MeasurementOptions:
     max_side_load: float = 0.8
     """Largest difference of an axle's loads left and right, over their sum [1]: no wheel leaves the ground.  With 0.56
     five blind diagnoses behind differentials (seed 504) are the same."""
+    unknown_slope: float = 0.4
+    """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, so that slopes alone take the
+    pull: 3 degrees for seconds, of which a window holds few independent ones (as `UNKNOWN_SIDE_SHARE`)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.modelled_drive import modelled_drive
 from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.pipeline.positions import PositionTrack
+from soilbus.report.proposal import BEARING_STD_WITHOUT_CELLS
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
 from soilbus.sensors.survey import Seen, Survey
@@ -241,13 +242,9 @@ def load_lines(config: Config) -> list[str]:
 
 def _way_out(std: float, limit: float) -> str:
     """What the configuration can do about a bearing pressure that is known to no better than the limit."""
-    if limit < std <= USUAL_LIMIT:
-        return f"without load cells set it to {USUAL_LIMIT:g}"
+    if limit < std <= BEARING_STD_WITHOUT_CELLS:
+        return f"without load cells set it to {BEARING_STD_WITHOUT_CELLS:g}"
     return "what is known of the soil, in [soil], narrows it"
-
-
-USUAL_LIMIT = 0.2
-"""`estimator.max_bearing_std` as `init` writes it for machines without load cells."""
 
 
 def _expected(config: Config) -> tuple[float, float] | None:

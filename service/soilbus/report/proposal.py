@@ -22,6 +22,9 @@ from soilbus.sensors.role_evidence import Facts, is_absent
 
 __all__ = ["Proposal", "proposal"]
 
+BEARING_STD_WITHOUT_CELLS = 0.2
+"""`estimator.max_bearing_std` [1] for machines without load cells: their windows know the bearing pressure to 10 to
+20 % (`soilbus check` says how well)."""
 COLUMN = 34
 """Column in which comments beside a value begin."""
 MOST_STATE_BITS = 8
@@ -310,7 +313,11 @@ def _put_rest(draft: _Draft) -> None:
     """Limits without load cells, noise, and candidates that no line names."""
     if not all(draft.matched("load", wheel) for wheel in WHEELS):
         draft.section("[estimator]")
-        draft.put("max_bearing_std", "0.2", "a window without load cells knows the bearing pressure to 10 to 20 %")
+        draft.put(
+            "max_bearing_std",
+            f"{BEARING_STD_WITHOUT_CELLS:g}",
+            "a window without load cells knows the bearing pressure to 10 to 20 %",
+        )
     draft.lines += [
         "",
         "# [noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold",
