@@ -223,10 +223,23 @@ class Search:
 def excess_without_effects(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, with_type: bool = False
 ) -> float:
-    """Excess of the squared residuals without those effects of the present model whose sizes are fitted.
+    """Excess E = chi-square - its expectation of the model without those effects whose sizes are fitted.
 
-    What these explain counts as what a search explains, whether a configuration or the type of the vehicle has put them
-    into the model: their formulas are not the field's either.  with_type: with those of the type.
+    Parameters
+    ----------
+    records, prior, present
+        The recordings, the prior of the soil, and the model fitted to them.
+    with_type
+        Whether the effects that other vehicles of the type have determined stay in the model.
+
+    Returns
+    -------
+    E [squared sd], at least that of the present model.
+
+    Notes
+    -----
+    What a fitted effect explains counts as what a search explains, whether a configuration or the type of the vehicle
+    has put it into the model: its formula is not the field's either.
     """
     if not present.effects:
         return present.excess

@@ -6,6 +6,8 @@
 `Measurements` keeps the instants at which some wheel is usable: forward motion (`window.forward` mirrors reversing),
 faster than `min_speed`, not in a turn (`window.turning`).  A value that is missing or has no finite variance is
 zero with a false mask.  Where no acceleration is measured it is the slope of the ground speed (`differentiated_speed`).
+The speed of a free wheel follows from the ground speed and has no noise of its own; the row of equal torques behind an
+open differential is none of the residuals: it fixes how the two wheels share their axle's load.
 """
 
 from __future__ import annotations

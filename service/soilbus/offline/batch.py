@@ -43,13 +43,7 @@ from soilbus.offline.fleet import (
     no_findings,
 )
 from soilbus.offline.jobs import BatchError, jobs_of
-from soilbus.offline.parts import (
-    Job,
-    OtherVersion,
-    Outcome,
-    part_of,
-    summary_of_part,
-)
+from soilbus.offline.parts import Job, OtherVersion, Outcome, part_of, summary_of_part
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
