@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import queue
 import shutil
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import soilbus
 from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
-from soilbus.offline.batch import BatchError, jobs_of, run_batch
+from soilbus.offline.batch import BatchError, jobs_of, run_batch, workers_watched
 from soilbus.offline.parts import Outcome
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
@@ -307,6 +308,16 @@ def test_a_lost_scheduler_is_one_line_and_leaves_what_is_done(in_process, config
         with pytest.raises(BatchError, match="scheduler is lost; --resume"):
             run_batch(client, own, tmp_path / "out", lose)
     assert len(list((tmp_path / "out/parts").iterdir())) >= 1
+
+
+def test_a_scheduler_without_workers_is_said_once_and_so_is_their_return(in_process):
+    heard = queue.Queue()
+    with in_process() as (local, client), workers_watched(client, heard.put, every=0.05):
+        local.scale(0)
+        assert heard.get(timeout=30) is False
+        local.scale(1)
+        assert heard.get(timeout=30) is True
+    assert heard.empty()
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,14 @@ def shown_by(record: Record) -> tuple[Detectable, ...]:
     return detectable([record], PRIOR, base, candidates)
 
 
+def test_where_no_effect_is_left_none_could_be_shown():
+    """A catalogue of one effect, which the model of the type has already."""
+    record = driven(dataclasses.replace(RICH, duration=20.0), 3)
+    base = fit_model([record], PRIOR, ())
+    assert base is not None
+    assert detectable([record], PRIOR, base, []) == ()
+
+
 def test_an_effect_that_no_datum_depends_on_has_no_evidence_either_way():
     """Without a draft its load cell has neither an offset nor a gain: the evidence stays exactly as it is."""
     record = driven(dataclasses.replace(RICH, duration=20.0), 3, without="draft")

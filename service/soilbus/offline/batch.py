@@ -18,6 +18,7 @@ import logging
 import math
 import os
 import shutil
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -47,10 +48,12 @@ from soilbus.offline.parts import Job, OtherVersion, Outcome, part_of, summary_o
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
-__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch"]
+__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch", "workers_watched"]
 
 CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
+WORKERS_COUNTED_EVERY = 10.0
+"""Seconds after which a scheduler is asked again whether it has workers."""
 TASKS_PER_THREAD = 3
 """Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
@@ -149,13 +152,49 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
             if others := _other_versions(client):
                 say(f"{address}: other versions of {', '.join(others)} there than here: install the same everywhere")
             _announce(client, say)
-            yield client
+            with workers_watched(client, partial(_say_of, address, say)):
+                yield client
 
 
 def _announce(client: Any, say: Callable[[str], None]) -> None:
     """Where Dask's own dashboard is, if there is one."""
     if find_spec("bokeh") and client.scheduler_info().get("services", {}).get("dashboard"):
         say(f"Dask's dashboard: {client.dashboard_link}")
+
+
+def _say_of(address: str, say: Callable[[str], None], has_workers: bool) -> None:
+    lost = "its workers are gone: the batch waits until one comes back (ctrl-C stops it, --resume goes on from here)"
+    say(f"{address}: {'it has workers again' if has_workers else lost}")
+
+
+@contextmanager
+def workers_watched(
+    client: Any, report: Callable[[bool], None], every: float = WORKERS_COUNTED_EVERY
+) -> Iterator[None]:
+    """Call `report` with False when the last worker of a scheduler has gone, and with True when there is one again.
+
+    every: time between two looks [s].  A scheduler that is lost itself ends the watch: its tasks are cancelled.
+    """
+    ended = threading.Event()
+
+    def watch() -> None:
+        had_workers = True
+        while not ended.wait(every):
+            try:
+                has_workers = bool(client.nthreads())
+            except Exception:  # of each protocol its own
+                return
+            if has_workers != had_workers:
+                report(has_workers)
+            had_workers = has_workers
+
+    thread = threading.Thread(target=watch, name="workers", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def worker_version() -> str:
