@@ -144,6 +144,8 @@ def diagnose(
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
         present = with_delays(records, prior, present, temperature(present.excess, options))
+    if not present.converged and not present.gap < base.gap:  # such an end has no evidence, and predicts worse
+        additions, present = [], base
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
