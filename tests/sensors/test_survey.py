@@ -478,13 +478,6 @@ def test_loads_of_a_front_and_a_rear_wheel_are_told_apart_by_the_draft(field_fra
     assert any(fault.startswith("load moves between front and rear") for fault in faults), faults
 
 
-def test_wheels_that_skid_while_they_drive_have_a_wrong_gear_or_radius(field_frames):
-    radii = [f"wheel.{w}.radius={r}" for w, r in zip(WHEELS, (0.38, 0.38, 0.47, 0.47), strict=True)]
-    (fault,) = beside(set_for(FIELD, radii), field_frames("loam")).faults
-    assert "skid" in fault
-    assert "radius" in fault
-
-
 def test_two_wheels_unlike_the_other_two_are_named_in_one_line(field_frames):
     (fault,) = beside(set_for(FIELD, ["wheel.FL.radius=1.0", "wheel.FR.radius=1.0"]), field_frames("loam")).faults
     assert re.search(r"wheels seem to slip unlike: FL and FR by 0\.[56]\d, RL and RR by 0\.[012]\d: radius", fault)

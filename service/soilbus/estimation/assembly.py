@@ -479,7 +479,7 @@ def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Ac
         if key not in names
     ]
     if effect.base_law not in (None, shear_law):
-        faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only")
+        faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only: set model.shear_law")
     values: dict[str, Any] = {}
     for parameter in effect.parameters:
         try:

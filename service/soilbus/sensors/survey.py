@@ -73,9 +73,6 @@ class Limits:
     gain error are 0.003 and 0.002 (`noise.speed`); behind an open differential a simulated drive on loam has 0.06."""
     pushed: float = -0.2
     """Least median slip of driving wheels."""
-    skids: float = -0.1
-    """Least slip of 5 % of the time in which wheels drive: a wheel that skids brakes (Wong 2008, ch. 2), and radius and
-    ground speed are known to a few per cent."""
     never_less: float = 0.45
     """Slip exceeded in 95 % of a drive, from which the speeds are implausible."""
     wheel_apart: float = 0.15
@@ -84,7 +81,8 @@ class Limits:
     """Largest median slip, either way, of a wheel that rolls freely: wheels towed through soft soil skid by 0.1 to 0.2
     (Wong 2008, ch. 4); simulated ones on loam by 0.02."""
     transfer: float = 0.75
-    """Least share of the load transfer by moments: 0 where a front and a rear cell are swapped, -1 where both are."""
+    """Least share of the load transfer by moments: 0 where a front and a rear cell are swapped, -1 where both are.  The
+    field vehicle has 1.2 +- 0.1 (on clay, where the draft hardly changes, 2.3 +- 0.5), a simulated drive 1.00."""
     scale: tuple[float, float] = (0.6, 1.3)
     """Range of the regression slope of thrust on draft."""
     excited: float = 0.008
@@ -687,16 +685,13 @@ def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
     at_shaft = any(w.speed is not None and w.speed.at == "shaft" for w in facts.config.wheel)
     at_shaft = at_shaft or any(a.motor_speed is not None for a in facts.config.axle)
     gear = "gear ratio, " if at_shaft else ""
-    skids = float(np.nanquantile(drives, 0.05))
-    if middle < limits.pushed or least > limits.never_less or skids < limits.skids:
-        seems = middle if middle < limits.pushed else least if least > limits.never_less else skids
+    if middle < limits.pushed or least > limits.never_less:
+        seems = middle if middle < limits.pushed else least
         factor = 1.0 / (1.0 - seems)
         text = (
             f"the wheels seem to slip by {middle:.2f}, never by less than {least:.2f}"
             if least > limits.never_less
             else f"driving wheels seem to slip by {middle:.2f}"
-            if middle < limits.pushed
-            else f"wheels that drive seem to skid by {-skids:.2f} for a twentieth of the time"
         )
         yield Finding(
             f"{text}: their rims go {factor:.2f} times as fast as the ground: {_why_fast(factor)}"
