@@ -20,7 +20,7 @@ from soilbus.offline.parts import Outcome
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.report.batch import batch_text
+from soilbus.report.batch import batch_text, fleet_text
 
 pd = pytest.importorskip("pandas")
 SHORT = "estimator.window=4"
@@ -243,6 +243,29 @@ def test_a_vehicle_whose_diagnosis_failed_is_diagnosed_again_on_request(client, 
     for retry, lines in said.items():
         run_batch(client, own, tmp_path, lines.append, diagnose=True, retry=retry)
     assert ["1 of 1 vehicles diagnosed" in lines for lines in said.values()] == [False, True]
+
+
+def test_a_diagnosis_of_an_earlier_run_does_not_stay_beside_other_logs(client, config, logs, moved, tmp_path):
+    (tmp_path / "logs/red").mkdir(parents=True)
+    (tmp_path / "logs/red/a.log").write_text(moved(0.0))
+    out, command = tmp_path / "out", [str(tmp_path / "logs")]
+    run_batch(client, jobs_of(config, "t", command, lambda _: config), out, diagnose=True)
+    assert (out / "diagnosis.json").is_file()
+    (tmp_path / "logs/red/b.log").write_text(moved(60.0))
+    batch = run_batch(client, jobs_of(config, "t", command, lambda _: config), out)
+    assert not (out / "diagnosis.json").exists()
+    assert not (out / "effects.parquet").exists()
+    assert "of an earlier run are removed; --diagnose writes them anew" in batch_text(batch, out)
+    again = run_batch(client, jobs_of(config, "t", command, lambda _: config), out)
+    assert "of an earlier run" not in batch_text(again, out)
+
+
+def test_a_parameter_at_the_edge_of_its_range_has_no_deviation_of_zero():
+    sizes = {"softening": {"value": 0.4, "std": 0.03}, "dug": {"value": 0.0, "std": 0.0}}
+    effect = {"name": "slip_sinkage", "parameters": sizes, "named": True, "onset": None}
+    vehicle = {"vehicle": "T1", "effects": [effect], "logs": ["a.log"], "fault": None}
+    text = fleet_text({"vehicles_diagnosed": 1, "vehicles": [vehicle], "false_discovery_rate": 0.1, "types": []})
+    assert "T1: slip_sinkage (softening 0.4 ± 0.03, dug 0 (at the edge of its range))" in text
 
 
 def test_a_manifest_names_vehicle_start_and_configuration(client, config, logs, drive, tmp_path):

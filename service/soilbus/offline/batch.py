@@ -63,6 +63,8 @@ COMPARED = ("python", "dask", "distributed", "numpy")
 """Packages of which other versions may fail, or compute other last digits."""
 STATES_AT_ONCE = 32
 """Files that are asked for their state at once: of 80 000 logs on a server that answers in 50 ms in two minutes."""
+OF_DIAGNOSIS = ("diagnosis.json", "effects.parquet")
+"""What `--diagnose` writes."""
 MAX_SENT_BYTES = 256 * 2**20
 """Bytes of a log that is sent along; it is in memory on its way."""
 
@@ -83,6 +85,8 @@ class Batch:
         Logs that were done before this run, and those of them whose fault was kept.
     fleet
         Content of diagnosis.json; None where it was not asked for.
+    stale_diagnosis
+        Whether that of an earlier run was there, and is removed.
     cpu_seconds, log_bytes, duration
         Cost of the logs of this run: processor time [s] and bytes, for recordings of `duration` [s].
     """
@@ -96,6 +100,7 @@ class Batch:
     cpu_seconds: float
     log_bytes: int
     duration: float
+    stale_diagnosis: bool = False
 
 
 # --- Dask
@@ -355,6 +360,9 @@ def run_batch(
     else:
         (out / "logs.parquet").unlink(missing_ok=True)
     dataset.write_rows(out / "vehicles.parquet", vehicles)
+    stale = [] if diagnose else [path for name in OF_DIAGNOSIS if (path := out / name).exists()]
+    for path in stale:
+        path.unlink()
     return Batch(
         vehicles,
         errors,
@@ -365,6 +373,7 @@ def run_batch(
         math.fsum(outcome.cpu_seconds for outcome in outcomes.values()),
         sum(outcome.log_bytes for outcome in outcomes.values()),
         math.fsum(summary["duration"] for digest, summary in summaries.items() if digest in outcomes),
+        bool(stale),
     )
 
 
@@ -554,8 +563,8 @@ def _diagnose_all(
         for vehicles in types.values()
     ]
     fleet = judged([of_type for of_type, _ in found], [each for _, findings in found for each in findings])
-    dataset.put(out / "diagnosis.json", (json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode())
-    dataset.write_rows(out / "effects.parquet", effect_rows(fleet), dataset.EFFECT_COLUMNS)
+    dataset.put(out / OF_DIAGNOSIS[0], (json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode())
+    dataset.write_rows(out / OF_DIAGNOSIS[1], effect_rows(fleet), dataset.EFFECT_COLUMNS)
     return fleet
 
 
