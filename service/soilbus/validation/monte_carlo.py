@@ -57,6 +57,7 @@ __all__ = [
     "Trial",
     "as_json",
     "driven",
+    "first_drive",
     "monte_carlo",
     "prior_about",
     "problem_of",
@@ -73,8 +74,8 @@ SLIP_RANGE = Swing(0.05, 0.40)
 """Slip of every drive."""
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-MAX_SOIL_DRAWS = 20
-"""Soils around a named one that are tried until the tractor can drive."""
+MAX_DRAWS = 100
+"""Drawn scenarios that are tried until the tractor drives one to its end."""
 _PHI = PARAMETERS.index("phi")
 
 
@@ -275,14 +276,30 @@ def driven(task: Task) -> tuple[Recording, Soil]:
     config, name, duration, seed, _, around = task
     rng, named = np.random.default_rng([seed, 3]), soil_named(name)
     spread = np.where(prior_of(config).log_std > 0.0, around, 0.0)
-    for _ in range(MAX_SOIL_DRAWS if around else 1):
-        soil = prior_about(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
-        of_drive = Soil(*soil.tolist())
-        with suppress(SimulationError) if around else nullcontext():
-            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP_RANGE), seed)
+
+    def draw() -> tuple[Soil, Scenario]:
+        median = prior_about(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
+        soil = Soil(*median.tolist())
+        return soil, Scenario(duration, (Patch(0.0, name, soil),), slip=SLIP_RANGE)
+
+    soil, recording = first_drive(config, draw, seed, MAX_DRAWS if around else 1)
+    return recording, soil
+
+
+def first_drive(
+    config: Config, draw: Callable[[], tuple[_T, Scenario]], seed: int, draws: int = MAX_DRAWS
+) -> tuple[_T, Recording]:
+    """The first drawn scenario that the vehicle drives to its end, as what was drawn with it and the recording.
+
+    Raises SimulationError, that of the last scenario, where the vehicle drives none of `draws`.
+    """
+    for left in reversed(range(draws)):
+        drawn, scenario = draw()
+        with suppress(SimulationError) if left else nullcontext():
+            recording = simulate(config, scenario, seed)
             if recording.bogged_at is None:
-                return recording, of_drive
-    raise SimulationError(f"the tractor gets stuck on {name}")
+                return drawn, recording
+    raise SimulationError(f"the tractor gets stuck on {scenario.soils[0].name}")
 
 
 def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:

@@ -1,15 +1,34 @@
-"""Windows of simulated channels as tasks for the service's own estimator."""
+"""Windows of simulated channels: in bins, as observations, and as tasks for the service's own estimator."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.can.channels import Column
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import motors_of
+from soilbus.estimation.assembly import model_of, motors_of, rig_of
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
 from soilbus.pipeline.positions import PositionTrack
+from soilbus.sensors.bins import Bins
+
+
+def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
+    """The samples of those channels that the configured rig has, in bins from 0 s on."""
+    rig = rig_of(config)
+    bins = Bins(rig, config.estimator.bin, 0.0)
+    bins.add({name: (c.t, c.value) for name in rig.channels if (c := channels.get(name)) is not None})
+    return bins
+
+
+def observed(config: Config, channels: Mapping[str, Column], duration: float) -> ObservationModel:
+    """The first `duration` [s] of the channels as one window to be fitted, without effects."""
+    window = bins_of(config, channels).window(0.0, duration)
+    return ObservationModel(window, rig_of(config), model_of(config), config.estimator.min_speed)
 
 
 def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:
