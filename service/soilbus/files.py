@@ -113,6 +113,12 @@ def whole_file(path: Path) -> Iterator[IO[str]]:
         raise NotWritten(f"{path}: {error.strerror or error}") from None
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file as `whole_file` does."""
+    with whole_file(path) as out:
+        out.write(text)
+
+
 @contextmanager
 def whole_file_of_bytes(path: Path) -> Iterator[IO[bytes]]:
     """A binary file that appears under its name only when it is complete.

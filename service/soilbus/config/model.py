@@ -25,6 +25,7 @@ from pydantic import (
     model_validator,
 )
 
+from soilbus.grouping import grouped
 from soilbus.words import did_you_mean
 
 __all__ = [
@@ -610,6 +611,14 @@ class NoiseOfChannels(_Section):
             raise ValueError("a fixed gain error of this sensor is not estimated: say it in absolute or relative")
         return noise
 
+    def scaled(self, factor: float, *parts: str) -> NoiseOfChannels:
+        """With these parts (by default all) of each channel's noise times a factor, which may be 0."""
+        noises = {name: getattr(self, name) for name in type(self).model_fields}
+        return self.model_copy(update={
+            name: noise.model_copy(update={part: factor * getattr(noise, part) for part in parts or Noise.model_fields})
+            for name, noise in noises.items()
+        })  # fmt: skip
+
 
 class Prior(_Section):
     """What is known of a soil parameter beforehand; std = 0 holds it at value."""
@@ -973,6 +982,11 @@ class Config(_Section):
         return self.track[0].rollers if self.track else 0
 
     @property
+    def tows_nothing(self) -> bool:
+        """Whether nothing is ever towed."""
+        return self.vehicle is not None and self.vehicle.towing == "never"
+
+    @property
     def on_tracks(self) -> bool:
         """Whether tracks carry the whole vehicle."""
         return bool(self.track) and all(t.axle is None for t in self.track)
@@ -991,7 +1005,7 @@ class Config(_Section):
                 raise ValueError(f"wheel {w.name}: axle: missing")
         for fault in self._faults_of_axles():
             raise ValueError(fault)
-        if self.vehicle is not None and self.vehicle.towing == "never" and self.signals.draft is not None:
+        if self.tows_nothing and self.signals.draft is not None:
             raise ValueError("vehicle.towing = never, but signals.draft is mapped: leave out one of the two")
         return self
 
@@ -1030,11 +1044,8 @@ class Config(_Section):
 
     def same_signal(self, role: str) -> list[list[Wheel]]:
         """The wheels that have a role (torque, speed, load), those on one and the same signal together."""
-        groups: dict[str, list[Wheel]] = {}
-        for wheel in self.wheel:
-            if (mapped := getattr(wheel, role)) is not None:
-                groups.setdefault(mapped.signal, []).append(wheel)
-        return list(groups.values())
+        mapped = [wheel for wheel in self.wheel if getattr(wheel, role) is not None]
+        return list(grouped(mapped, lambda wheel: getattr(wheel, role).signal).values())
 
     @property
     def soil_prior(self) -> dict[str, Prior]:

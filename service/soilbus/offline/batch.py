@@ -32,6 +32,7 @@ from typing import Any
 
 from soilbus import __version__
 from soilbus.config.model import ConfigError
+from soilbus.grouping import grouped
 from soilbus.offline import dataset
 from soilbus.offline.fleet import (
     Given,
@@ -499,13 +500,10 @@ def _diagnose_all(
     retry: bool,
 ) -> dict[str, Any]:
     """Findings of every vehicle, kept one by one, those of each type together, and the fleet's diagnosis of them."""
-    groups: dict[tuple[str, str], list[Job]] = {}
-    for job in sorted(jobs, key=lambda job: (summaries.get(job.digest, {}).get("begin") or 0, job.log)):
-        if job.digest in summaries:
-            groups.setdefault((job.setup.digest, job.vehicle), []).append(job)
-    types: dict[str, list[list[Job]]] = {}
-    for (setup, _), group in sorted(groups.items()):
-        types.setdefault(setup, []).append(chosen(group))
+    read = [job for job in jobs if job.digest in summaries]
+    read.sort(key=lambda job: (summaries[job.digest].get("begin") or 0, job.log))
+    of_vehicles = grouped(read, lambda job: (job.setup.digest, job.vehicle))
+    types = grouped((chosen(group) for _, group in sorted(of_vehicles.items())), lambda group: group[0].setup.digest)
     found = [
         findings_of_type(
             vehicles[0][0].setup,

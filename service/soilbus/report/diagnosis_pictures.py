@@ -14,6 +14,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, Series
 from soilbus.estimation.posterior import Estimate
+from soilbus.grouping import grouped
 from soilbus.offline.diagnose import Findings
 from soilbus.report.page import Picture, picture
 
@@ -167,10 +168,8 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales
 
 def channel_gaps(fitted: FittedModel) -> dict[str, float]:
     """Mean square of the standardised residuals of each channel's held-out readings; 1 is noise."""
-    found: dict[str, list[Array]] = {}
-    for series in fitted.held_out_series():
-        found.setdefault(series.channel, []).append(series.standardised)
-    return {channel: float(np.mean(np.concatenate(parts) ** 2)) for channel, parts in found.items()}
+    found = grouped(fitted.held_out_series(), lambda series: series.channel)
+    return {c: float(np.mean(np.concatenate([part.standardised for part in of]) ** 2)) for c, of in found.items()}
 
 
 def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
@@ -276,9 +275,7 @@ def _draw_drafts(
 
 def residual_picture(fitted: FittedModel, title: str) -> Picture:
     """Standardised residuals by channel (rows) over slip, load and time (columns)."""
-    channels: dict[str, list[Series]] = {}
-    for series in fitted.held_out_series():
-        channels.setdefault(series.channel, []).append(series)
+    channels = grouped(fitted.held_out_series(), lambda series: series.channel)
     return picture(
         lambda figure: _draw_residuals(figure, channels, title),
         0.6 + 2.2 * len(channels),

@@ -80,14 +80,9 @@ def shown(case: Case) -> Shown:
 def driven_without_noise(case: Case, parts: tuple[Hidden, ...]) -> Recording:
     """The drive with these parts, and sensors without noise or gain errors."""
     how = together(parts)
-    driven = simulate(how.tractor(_quiet(case.config)), how.way(case.scenario), case.seed, how.effects)
+    quiet = case.config.model_copy(update={"noise": case.config.noise.scaled(0.0)})
+    driven = simulate(how.tractor(quiet), how.way(case.scenario), case.seed, how.effects)
     return how.after(driven)
-
-
-def _quiet(config: Config) -> Config:
-    silent = {"absolute": 0.0, "relative": 0.0, "of_mean": 0.0, "gain": 0.0}
-    none = {q: getattr(config.noise, q).model_copy(update=silent) for q in type(config.noise).model_fields}
-    return config.model_copy(update={"noise": config.noise.model_copy(update=none)})
 
 
 class _Reading(NamedTuple):

@@ -87,18 +87,12 @@ def assumed_of(soil: Soil, rng: np.random.Generator) -> Soil:
 
 def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
     """10 s of the full simulator, slip swept between 0.05 and 0.4, bins of 0.1 s."""
-    quiet = [f"noise.{q}.{kind}=1e-9" for q in _NOISY for kind in _NOISY[q]] if noise_free else []
+    config = reference_configuration()
+    quiet = config.model_copy(update={"noise": config.noise.scaled(0.0)}) if noise_free else config
     scenario = Scenario(LENGTH, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
-    recording = simulate(reference_configuration(quiet), scenario, seed)
-    problem = observed(reference_configuration(), recording.channels, LENGTH)
+    recording = simulate(quiet, scenario, seed)
+    problem = observed(config, recording.channels, LENGTH)
     return Case(soil, assumed_of(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
-
-
-_NOISY = {
-    "torque": ("of_mean", "gain"), "load": ("relative", "gain"), "speed": ("relative", "gain"),
-    "ground_speed": ("relative", "gain"), "draft": ("absolute", "gain"), "sinkage": ("absolute",),
-    "pitch": ("absolute",), "acceleration": ("absolute",),
-}  # fmt: skip
 
 
 def entry_angles(problem: ObservationModel) -> Array:

@@ -35,6 +35,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.tracker import Tracker, TrackerOutput
 from soilbus.estimation.window import Window
+from soilbus.grouping import grouped
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
@@ -102,9 +103,7 @@ def needed_messages(config: Config, quantities: Sequence[str] = NEEDED) -> tuple
 
 def good_moment(config: Config = CONFIG, seed: int = 3) -> Moment:
     """The last frames of each message in a good drive."""
-    found: Moment = {}
-    for message in drive_messages(config, 10.0, seed):
-        found.setdefault(message.arbitration_id, []).append(message)
+    found = grouped(drive_messages(config, 10.0, seed), lambda message: message.arbitration_id)
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
