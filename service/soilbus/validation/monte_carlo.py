@@ -34,16 +34,15 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.simulator.sensors import true_readings
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 from soilbus.validation.bayes_risk_bound import BayesRisk, bayes_risk
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import sample_posterior
+from soilbus.validation.windows import bins_of, exact
 from soilbus.workers import workers
 
 __all__ = [
@@ -339,18 +338,14 @@ def problem_of(
     recording: Recording, config: Config, duration: float, names: Iterable[str], of_truth: bool
 ) -> ObservationModel:
     """The window of these channels as measured, or as it truly was at the times of the samples."""
-    rig, truth = rig_of(config), recording.truth
     columns = {name: recording.channels[name] for name in names}
-    readings = true_readings(truth, config, columns) if of_truth else {}
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({
-        name: (column.t, np.interp(column.t, truth["t"], readings[name]) if of_truth else column.value)
-        for name, column in columns.items()
-    })  # fmt: skip
-    window, settings = store.window(0.0, duration), config.estimator
+    if of_truth:
+        columns = exact(recording, config, columns)
+    window, settings = bins_of(config, columns).window(0.0, duration), config.estimator
     return ObservationModelWithEffects(
-        window, rig, model_of(config), settings.min_speed, settings.max_turn, *effects_and_parameters_of(config)
-    )
+        window, rig_of(config), model_of(config), settings.min_speed, settings.max_turn,
+        *effects_and_parameters_of(config),
+    )  # fmt: skip
 
 
 def _logarithms(posterior: Posterior, config: Config) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -40,11 +40,10 @@ from soilbus.simulator.drivetrain import drivetrain_of
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
-from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
 from soilbus.validation.monte_carlo import Each, first_drive, prior_about
-from soilbus.validation.windows import bins_of, task_of, torque_limits
+from soilbus.validation.windows import bins_of, exact, task_of, torque_limits
 
 SOIL_LOG_SD = 0.2
 """Standard deviation of the logarithms of a drive's soil parameters about the table's soil."""
@@ -232,16 +231,9 @@ def _ground(config: Config, rng: np.random.Generator) -> Ground:
 
 def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> Window:
     """The window as measured, or as the vehicle's own quantities truly were at the times of the samples."""
-    columns = recording.channels
+    columns: Mapping[str, Column] = recording.channels
     if of_truth:
-        truth, mapped = dict(recording.truth), config.signals.acceleration
-        if mapped is not None and mapped.kind == "specific_force":
-            truth["acceleration"] = truth["acceleration"] + GRAVITY * np.sin(truth["pitch"])
-        columns = {
-            n: Column(c.t, np.interp(c.t, truth["t"], truth[n]))
-            for n, c in columns.items()
-            if n in VEHICLE_QUANTITIES and n in truth
-        }
+        columns = exact(recording, config, [name for name in columns if name in VEHICLE_QUANTITIES])
     return completed(forward(bins_of(config, columns).window(0.0, config.estimator.window)), rig)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.sensors import true_readings
 
 
 def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
@@ -23,6 +25,13 @@ def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
     bins = Bins(rig, config.estimator.bin, 0.0)
     bins.add({name: (c.t, c.value) for name in rig.channels if (c := channels.get(name)) is not None})
     return bins
+
+
+def exact(recording: Recording, config: Config, names: Iterable[str]) -> dict[str, Column]:
+    """What sensors without errors and effects would have read at the times of these channels' samples."""
+    truth, times = recording.truth, {name: recording.channels[name].t for name in names}
+    readings = true_readings(truth, config, times)
+    return {name: Column(t, np.interp(t, truth["t"], readings[name])) for name, t in times.items()}
 
 
 def observed(config: Config, channels: Mapping[str, Column], duration: float) -> ObservationModel:
