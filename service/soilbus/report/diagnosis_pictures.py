@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,7 +103,10 @@ def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Pictur
         difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
         typical = float(np.sqrt(np.mean(difference**2)))
         caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
-        yield caption[0].upper() + caption[1:], _agreement_picture(of, series, scales, f"{when}{name}")
+        yield (
+            caption[0].upper() + caption[1:],
+            picture(partial(_draw_agreement, of=of, series=series, scales=scales), 4.6, f"{when}{name}"),
+        )
 
 
 class _Scales(NamedTuple):
@@ -131,10 +135,6 @@ def _ends(values: Array) -> tuple[float, float]:
     low, high = np.percentile(values, (100.0 - POINTS_SHOWN, POINTS_SHOWN)).tolist()
     space = 0.05 * (high - low) or 1.0
     return low - space, high + space
-
-
-def _agreement_picture(of: Agreement, series: Sequence[Series], scales: _Scales, words: str) -> Picture:
-    return picture(lambda figure: _draw_agreement(figure, of, series, scales), 4.6, words)
 
 
 def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales: _Scales) -> None:
@@ -174,7 +174,7 @@ def channel_gaps(fitted: FittedModel) -> dict[str, float]:
 
 def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
     """Root of the gap of each channel, before and after, as bars."""
-    models = _before_and_after(base, completed)
+    models = {"before": base} if base is completed else {"before": base, "after": completed}
     bars = {when: {c: gap**0.5 for c, gap in channel_gaps(model).items()} for when, model in models.items()}
     words = "; ".join(
         " ".join([when, *(f"{channel} {size:.2f}" for channel, size in of.items())]).strip()
@@ -182,11 +182,6 @@ def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
     )
     height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
     return picture(lambda figure: _draw_gaps(figure, bars), height, f"error of the model over noise: {words}")
-
-
-def _before_and_after(before: FittedModel, after: FittedModel) -> dict[str, FittedModel]:
-    """Both by name, or what was before alone where nothing was added."""
-    return {"before": before} if before is after else {"before": before, "after": after}
 
 
 def _bars(

@@ -11,7 +11,7 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.grouping import grouped
-from soilbus.pipeline.result import WindowResult
+from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.report.advice import advice, of_use
 from soilbus.report.page import Picture, Source, Table, page
 from soilbus.report.replay_pictures import (
@@ -20,7 +20,6 @@ from soilbus.report.replay_pictures import (
     curve_pictures,
     dates,
     decision_picture,
-    is_clock,
     map_pictures,
     run_pictures,
 )
@@ -152,7 +151,7 @@ def _windows(results: Sequence[WindowResult]) -> Table:
     rows = [
         (
             r.log or "-",
-            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_clock(r.t) else f"{r.t:.1f}",
+            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_date(r.t) else f"{r.t:.1f}",
             str(r.status) + ("" if r.reason == "none" else f" ({r.reason})"),
             "-" if r.bearing is None else f"{r.bearing.value / 1e3:.2f} ± {r.bearing.std / 1e3:.2f}",
             "-" if r.traversability.max_draft is None else f"{r.traversability.max_draft.value / 1e3:.2f}",

@@ -13,7 +13,6 @@ from soilbus.estimation.assembly import model_of, motors_of, rig_of
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
-from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import true_readings
@@ -67,10 +66,6 @@ def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np
         end=end,
         window=window,
         slip={wheel.name: None for wheel in config.wheel},
-        missing=(),
-        poor=(),
         torque_limit=torque_limit,
-        track=PositionTrack({}),
-        rejected={},
         fresh=fresh,
     )
