@@ -35,6 +35,7 @@ from soilbus.estimation.window import (
     turning,
     zero_if_unknown,
 )
+from soilbus.sensors.bins import bin_means
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
 
 SUSTAINED = 1.0
@@ -175,12 +176,7 @@ class SensorConsistency:
             if not heard:
                 continue
             t, value = (np.concatenate(parts) for parts in zip(*heard, strict=True))
-            bins = np.floor((t - begin) / self._settings.bin + 1e-6).astype(np.intp)
-            inside = (bins >= 0) & (bins < n)
-            count = np.bincount(bins[inside], minlength=n)
-            total = np.bincount(bins[inside], np.abs(value[inside]), minlength=n)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                speed[:, self._rig.wheels.index(wheel)] = total / count
+            speed[:, self._rig.wheels.index(wheel)] = bin_means(t, np.abs(value), begin, self._settings.bin, n)
         return speed
 
 

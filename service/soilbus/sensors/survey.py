@@ -34,7 +34,7 @@ from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
 from soilbus.grouping import grouped
-from soilbus.sensors.bins import Bins
+from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
@@ -285,22 +285,14 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | Non
     motor = np.full(raw.speed.shape, np.nan)
     for i, wheel in enumerate(rig.wheels):
         if f"motor_speed.{wheel}" in heard:
-            motor[:, i] = _binned(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
+            motor[:, i] = bin_means(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
     of_axles: dict[str, tuple[Array, Array]] = {
         a.name: heard[f"speed.{a.name}"] for a in config.axle if f"speed.{a.name}" in heard
     }
-    shaft = {name: _binned(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
+    shaft = {name: bin_means(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
     moving = np.abs(window.ground_speed) > config.estimator.min_speed
     straight = moving & ~turning(window, rig, config.estimator.max_turn)
     return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped))
-
-
-def _binned(t: Array, value: Array, start: float, bin_length: float, n: int) -> Array:
-    place = np.floor((t - start) / bin_length + 1e-9).astype(np.intp)
-    inside = (place >= 0) & (place < n)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        count = np.bincount(place[inside], minlength=n)
-        return np.asarray(np.bincount(place[inside], value[inside], minlength=n) / count)
 
 
 # --- one signal by itself ---
