@@ -1,4 +1,4 @@
-"""Files that a user names, read whatever they turn out to be, and outputs that are there whole or not at all.
+"""Bounded reading of files that a user names, and outputs that are there whole or not at all.
 
 What is read may be a device without end, a pipe, a folder; what is written stays whole even when its process is killed.
 """

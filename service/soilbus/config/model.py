@@ -65,7 +65,7 @@ SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; `faults` holds one line for each fault, whatever the names in it hold."""
+    """The configuration cannot be used; `faults` holds one line for each fault, without line breaks of names."""
 
     def __init__(self, faults: Iterable[str]) -> None:
         self.faults = [_printable(fault) for fault in faults]
@@ -774,7 +774,7 @@ class Traversability(_Section):
 
 
 class Warning(_Section):
-    """When soilbus warns of immobilisation from slip and speed alone, whatever soil it is.
+    """When soilbus warns of immobilisation from slip and speed alone, without any estimate of the soil.
 
     Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
     thesis, 2023, ch. 7), with eleven others looked at: `python -m soilbus.validation.snow`.
@@ -964,7 +964,7 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _tracks_as_wheels(self) -> Config:
-        """`wheel` holds the tracks, too, behind the wheels: whatever runs on the ground."""
+        """`wheel` holds the tracks, too, behind the wheels: all that runs on the ground."""
         if self.track and (self.wheel or len(self.track) == 1) and any(t.axle is None for t in self.track):
             raise ValueError("a [[track]] beside [[wheel]]s, or alone, needs its axle")
         if len({t.rollers for t in self.track}) > 1:

@@ -383,7 +383,7 @@ def has_cause(watch: Watch, loss: TractionLoss, hold: float) -> bool:
 
 
 def ended(watch: Watch) -> Watch:
-    """The watch after a decision is go: a warning that only lasts is over, and begins anew with a new cause only."""
+    """The watch after a decision is go: a warning without a cause is over, and only a new cause begins another."""
     return watch._replace(caused=-math.inf, warning=Alert.NONE)
 
 

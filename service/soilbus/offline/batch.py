@@ -2,11 +2,10 @@
 
     LOG...  ->  jobs  ->  parts/DIGEST.gz (one a log)  ->  windows, summaries, errors, map
 
-Only logs that have no part yet are replayed, so a run that was stopped, whatever stopped it, loses the logs in work
-and no more.  What is wrong with a log is kept as well, and beside both the state of its file (parts/DIGEST.kept): a
-log whose file changed is read again.  Workers need neither the configuration nor the DBC files nor the output folder:
-settings travel with a job, and parts come back.  Workers open a log by its path or URL; where they do not see the path,
-it is sent along.
+Only logs that have no part yet are replayed, so a run that is stopped loses only the logs in work. The fault of a log
+is kept as well, and beside both the state of its file (parts/DIGEST.kept): a log whose file changed is read again.
+Workers need neither the configuration nor the DBC files nor the output folder: settings travel with a job, and parts
+come back. Workers open a log by its path or URL; where they do not see the path, it is sent along.
 """
 
 from __future__ import annotations

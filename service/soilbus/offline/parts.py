@@ -213,7 +213,7 @@ def unpacked(content: bytes) -> tuple[Config, Database | None]:
 
 
 def part_of(job: Job, version: str) -> Outcome:
-    """Replay one log; whatever is wrong with it is in the outcome.
+    """Replay one log; its fault, if it has one, is in the outcome.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A bus, a clock, workers and a service on them that tests hold in their hands, and frames of a drive."""
+"""Scripted bus, clock and workers for tests, a service on them, and the frames of a simulated drive."""
 
 from __future__ import annotations
 

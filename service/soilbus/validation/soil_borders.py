@@ -1,8 +1,8 @@
 """Drives over borders: how soon a valid estimate of the new soil comes, and whether any valid one is wrong.
 
-A window is valid where it knows the bearing pressure of a plate at a given depth.  However
-little the loads change, it knows sooner what its own tyres measure: the pressure under each of them
-at about half its depth, and tan phi.  The table has from when, and whether that is wrong.
+A window is valid once it determines the bearing pressure of a plate at a given depth.  It determines the pressure under
+its own tyres at about half their sinkage, and tan phi, sooner, even where loads hardly change.  The table has the time
+of both after the border, and the number of wrong windows.
 
 `python -m soilbus.validation.soil_borders [loam:wet_clay …] [--speeds 1.5] [--transition 1] [--seeds 20] [--first 1]`
 prints a table; `--windows` every window near the border besides.

@@ -1,4 +1,4 @@
-"""One figure of the bench, and how times are taken on a machine that does other things too.
+"""One figure of the bench, and the timing of code on a machine with other load.
 
 time = least of several runs: other load only adds
 """

@@ -1,14 +1,14 @@
-"""How much of a hidden effect a recording shows at all, by the generator alone: nothing of the diagnosis is asked.
+"""How much of a hidden effect a recording can show at all, computed without any code of the diagnosis.
 
 The tractor drives without noise and gain errors, with the effect and without.  The plain wheel-soil model h (the rim
 integral beside this file) is fitted to the readings y of the drive with it.  Unknown are the latents x of each
-instant (entry angles, slips, motion) and, over the whole drive, what the configuration knows more or less: the
-soil and the gain errors g, together q.
+instant (entry angles, slips, motion) and, for the whole drive, the soil and the gain errors g, together q, with the
+priors of the configuration.
 
     E = min over x, q of |S^-1 (y - d - (1 + g) h(x, soil))|^2 + |q / sd(q)|^2
 
-S is the noise of the sensors, d what h leaves of the drive without the effect: another effect, and what the rim
-integral is short of the simulator.  E is by how much -2 log posterior would fall for an analyst who adds the very
+S is the noise of the sensors, d the residual of h for the drive without the effect: another effect, and the error of
+the rim integral against the simulator.  E is by how much -2 log posterior would fall for an analyst who adds the very
 formula of the generator.
 """
 

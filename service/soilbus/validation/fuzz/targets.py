@@ -210,7 +210,7 @@ def check_service(data: bytes) -> int:
 
 
 class _Paced(ScriptedBus):
-    """Hands out messages every 5 ms, whatever their stamps say."""
+    """Hands out messages every 5 ms, not by their stamps."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         due = 1000.0 + 0.005 * self.next

@@ -1,8 +1,7 @@
-"""A service on a spoilt wire, and an onlooker who judges each verdict by what he knows of the wire's deliveries.
+"""A service on a faulty bus, and an onlooker who knows each fault and judges each decision of the service by it.
 
-The wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as asked.  The soil comes
-from a tracker that says of each window what is true of the ground at its end: GO then hangs on
-what the wire delivers alone, as often as the service lets it.
+The bus repeats the last moments of a good drive at 10 Hz, with the faults of a story.  The tracker returns the true
+soil at the end of each window, so whether the decision is GO depends on the delivered frames alone.
 """
 
 from __future__ import annotations
