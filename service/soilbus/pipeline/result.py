@@ -136,7 +136,7 @@ class WindowResult:
         return able.over_slip if able is not None and fits else None
 
 
-def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:
+def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool) -> WindowResult:
     """The result at a later time.
 
     Parameters

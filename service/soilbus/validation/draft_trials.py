@@ -74,10 +74,8 @@ class DraftFigures:
     true: float
 
 
-def draft_trials(
-    config: Config, drives: int, seed: int, soils: Sequence[str] = SOILS, each: Each = map
-) -> Iterator[DraftFigures]:
-    """Figures of each soil, then of all soils.
+def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> Iterator[DraftFigures]:
+    """Figures of each of SOILS, then of all.
 
     Parameters
     ----------
@@ -87,20 +85,16 @@ def draft_trials(
         Number on each soil.
     seed
         The same seed gives the same drives.
-    soils
-        Names of the table.
     each
         The built-in map, or that of monte_carlo.processes.
 
     Raises
     ------
-    KeyError
-        A soil is unknown.
     SimulationError
         The tractor cannot drive on one.
     """
     everything: list[DraftTrial] = []
-    for name in soils:
+    for name in SOILS:
         key = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
         tasks = [Task(config, name, int(s)) for s in key.generate_state(drives)]
         everything += (of_soil := list(each(trial, tasks)))

@@ -100,9 +100,9 @@ def needed_messages(config: Config, quantities: Sequence[str] = NEEDED) -> tuple
     return tuple(dict.fromkeys(signal.partition(".")[0] for signal in mapped))
 
 
-def good_moment(config: Config = CONFIG, seed: int = 3) -> Moment:
+def good_moment(config: Config = CONFIG) -> Moment:
     """The last frames of each message in a good drive."""
-    found = grouped(drive_messages(config, 10.0, seed), lambda message: message.arbitration_id)
+    found = grouped(drive_messages(config, 10.0), lambda message: message.arbitration_id)
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
@@ -135,13 +135,13 @@ def fit_of(tracked: TrackerOutput) -> Fit:
     return tracked.fit
 
 
-def good_tracked(config: Config = CONFIG, seed: int = 3) -> TrackerOutput:
+def good_tracked(config: Config = CONFIG) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
     limits = {"max_bearing_std": config.estimator.max_bearing_std}
     config = config.model_copy(update={"estimator": reference_configuration().estimator.model_copy(update=limits)})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
-    messages = drive_messages(config, 20.0, seed)
+    messages = drive_messages(config, 20.0)
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
