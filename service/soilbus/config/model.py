@@ -168,29 +168,22 @@ class Dbc(_Section):
 
 
 class Signal(_Section):
-    """Where a role's value comes from: "Message.Signal", or a table with more to say.
-
-    `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
-    signal of the same message) that must hold one of `valid_values` for the value to
-    count.  `at` is the side of the gear on which a torque or speed is measured.
-    `timeout` [s] is the age from which the channel counts as stale.  `delay` [s] is how much
-    earlier what a sample reports was true: a radar's filter, a receiver's solution, a queue.
-    """
+    """Where a role's value comes from: "Message.Signal", or a table with more to say."""
 
     signal: SignalName
     """`Message.Signal` of the DBC."""
     sign: Literal[1, -1] = 1
     """-1 for a sensor mounted the other way round."""
     at: Literal["wheel", "shaft"] | None = None
-    """Side of the gear on which it is measured."""
+    """Side of the gear on which a torque or speed is measured."""
     valid: str | None = None
-    """Signal that must hold one of `valid_values` for the value to count."""
+    """Signal, of the same message or another, that must hold one of `valid_values` for the value to count."""
     valid_values: list[int] = Field(default_factory=lambda: [1])
     """See `valid`."""
     timeout: PositiveFloat | None = None
     """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
-    """How much earlier what a sample reports was true [s]: a filter, a receiver, a queue."""
+    """How much earlier what a sample reports was true [s]: a radar's filter, a receiver's solution, a queue."""
     torque_constant: PositiveFloat | None = None
     """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
     reference_torque: PositiveFloat | None = None
@@ -314,12 +307,7 @@ class Axle(_Section):
 
 
 class Wheel(_Section):
-    """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
-
-    `max_torque` [N m] is the motor's limit at the wheel where no signal reports it.  Only the
-    wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
-    Of the wheels of an axle, the left one stands first.
-    """
+    """One wheel and its sensors; only the wheel of a test rig has no axle, and of an axle the left one stands first."""
 
     name: Name
     """For messages, JSON and frames: FL, FR, RL, RR on a tractor."""
