@@ -113,7 +113,7 @@ def whole_file(path: Path) -> Iterator[IO[str]]:
         raise NotWritten(f"{path}: {error.strerror or error}") from None
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Write a text file as `whole_file` does."""
     with whole_file(path) as out:
         out.write(text)

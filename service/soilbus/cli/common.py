@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from soilbus.files import write_whole
+from soilbus.files import write_text
 
 if TYPE_CHECKING:
     from soilbus.config.model import Config
@@ -44,7 +44,7 @@ def need_extra(module: str, extra: str, what: str) -> None:
 def report(path: Path | None, record: Any, text: str) -> None:
     """A record as JSON where --json says; the text, unless standard output is for the JSON."""
     if path is not None:
-        write_whole(path, json.dumps(record, indent=1) + "\n")
+        write_text(path, json.dumps(record, indent=1) + "\n")
     if str(path) != "-":
         print(text, end="")
 

@@ -22,7 +22,7 @@ from soilbus.cli.common import (
     reading_or_writing,
     report,
 )
-from soilbus.files import whole_file, write_whole
+from soilbus.files import whole_file, write_text
 from soilbus.process import say
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     if found is None:
         return ""
     if args.manoeuvre_out is not None:
-        write_whole(args.manoeuvre_out, json.dumps(found[0].as_json(), indent=1) + "\n")
+        write_text(args.manoeuvre_out, json.dumps(found[0].as_json(), indent=1) + "\n")
     return "\n".join(excitation_lines(*found, now, config)) + "\n"
 
 
@@ -156,7 +156,7 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     if args.report is not None:
         from soilbus.report.replay import replay_report
 
-        write_whole(args.report, replay_report(results, text, _source(args, config)))
+        write_text(args.report, replay_report(results, text, _source(args, config)))
     if args.table is not None:
         write_table(args.table, results, config)
     if args.mcap is not None:
@@ -166,7 +166,7 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
         if args.map.suffix == ".gpkg":
             write_geopackage(args.map, map_text)
         else:
-            write_whole(args.map, map_text)
+            write_text(args.map, map_text)
         if left_out:
             say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
@@ -334,7 +334,7 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.manoeuvre_out is not None and findings.plan is not None:
         texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
-        write_whole(path, text)
+        write_text(path, text)
     if all(str(path) != "-" for path, _ in texts):
         print(findings_text(findings), end="")
     if args.manoeuvre_out is not None and findings.plan is None:
