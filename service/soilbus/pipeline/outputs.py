@@ -335,7 +335,7 @@ def known(value: Any) -> Any:
     """Nested dicts, lists and numbers for JSON: None instead of every number that is not finite."""
     if isinstance(value, Mapping):
         return {key: known(each) for key, each in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [known(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 

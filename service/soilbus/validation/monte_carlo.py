@@ -11,7 +11,6 @@ soils drawn around the named one (`around`).
 
 from __future__ import annotations
 
-import math
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,6 +33,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
+from soilbus.pipeline.outputs import known
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -413,19 +413,16 @@ def _bayes_risk_figures(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Ba
 
 def as_json(cell: Cell) -> dict[str, Any]:
     """The cell's figures as plain objects; null for what is not a number."""
-
-    def number(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
     columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
     if cell.bayes_risk is not None:
         columns |= {"least": cell.bayes_risk.least, "least_scatter": cell.bayes_risk.least_scatter}
         columns |= {"best": cell.bayes_risk.best, "rms_beside_best": cell.bayes_risk.ours}
-    return {
+    figures: dict[str, Any] = known({
         "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
-        "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,
+        "failed": cell.failed, "not_converged": cell.not_converged, "chi2": cell.chi2, "seconds": cell.seconds,
         "quantities": {
-            name: {figure: number(float(column[i])) for figure, column in columns.items()}
+            name: {figure: float(column[i]) for figure, column in columns.items()}
             for i, name in enumerate(cell.quantities)
         },
-    }  # fmt: skip
+    })  # fmt: skip
+    return figures
