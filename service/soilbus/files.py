@@ -1,4 +1,4 @@
-"""Files that a user names, read whatever they turn out to be, and outputs that are there whole or not at all.
+"""Bounded reading of files that a user names, and outputs that are there whole or not at all.
 
 What is read may be a device without end, a pipe, a folder; what is written stays whole even when its process is killed.
 """
@@ -111,6 +111,12 @@ def whole_file(path: Path) -> Iterator[IO[str]]:
             yield out
     except OSError as error:
         raise NotWritten(f"{path}: {error.strerror or error}") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file as `whole_file` does."""
+    with whole_file(path) as out:
+        out.write(text)
 
 
 @contextmanager

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from soilbus.files import write_text
 
 if TYPE_CHECKING:
     from soilbus.config.model import Config
@@ -34,6 +39,25 @@ def need_extra(module: str, extra: str, what: str) -> None:
 
     if find_spec(module) is None:
         raise WorkError(f"{what} needs the extra soilbus[{extra}]")
+
+
+def report(path: Path | None, record: Any, text: str) -> None:
+    """A record as JSON where --json says; the text, unless standard output is for the JSON."""
+    if path is not None:
+        write_text(path, json.dumps(record, indent=1) + "\n")
+    if str(path) != "-":
+        print(text, end="")
+
+
+@contextmanager
+def reading_or_writing(path: Path) -> Iterator[None]:
+    """Say an error of a file in one line with its name."""
+    try:
+        yield
+    except OSError as error:
+        raise WorkError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{path}: {error}") from None
 
 
 def check_folders(*paths: Path | None) -> None:

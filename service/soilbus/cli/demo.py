@@ -27,7 +27,7 @@ from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config.model import Config
 from soilbus.daemon.start import start_service
-from soilbus.files import whole_file
+from soilbus.files import write_text
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.received_frames import ReceivedFrames
@@ -82,8 +82,7 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
             worker.join(timeout=2.0)
     if picture is not None:
         for name, path in (("driver", picture), ("engineer", picture.with_stem(f"{picture.stem}-engineer"))):
-            with whole_file(path) as out:
-                out.write(_svg(pictures[name]))
+            write_text(path, _svg(pictures[name]))
     if console.is_terminal:
         console.print(pictures["driver"])
     console.print("\n" + _story(results), highlight=False, end="")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Iterable
+from typing import Any
 
 from soilbus.report.table import table
 from soilbus.terra.effects.effect import Effect
@@ -36,24 +36,21 @@ def overview(effects: Iterable[Effect]) -> str:
     return table(("effect", "physics"), rows) + more
 
 
-def effects_json(effects: Iterable[Effect]) -> str:
-    """All that the catalogue says of effects, a list of objects."""
-    return json.dumps(
-        [
-            {
-                "name": effect.name,
-                "physics": effect.physics,
-                "parameters": [
-                    {"name": p.name, "unit": p.unit, "absent_at": p.neutral, "std": p.std, "range": [p.low, p.high]}
-                    for p in effect.parameters
-                ],
-                "shown_by": effect.tells,
-                "source": effect.source,
-            }
-            for effect in effects
-        ],
-        indent=1,
-    )
+def effect_records(effects: Iterable[Effect]) -> list[dict[str, Any]]:
+    """All that the catalogue says of effects, for JSON."""
+    return [
+        {
+            "name": effect.name,
+            "physics": effect.physics,
+            "parameters": [
+                {"name": p.name, "unit": p.unit, "absent_at": p.neutral, "std": p.std, "range": [p.low, p.high]}
+                for p in effect.parameters
+            ],
+            "shown_by": effect.tells,
+            "source": effect.source,
+        }
+        for effect in effects
+    ]
 
 
 def _wrapped(text: str) -> str:

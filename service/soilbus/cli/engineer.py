@@ -19,8 +19,10 @@ from soilbus.cli.common import (
     configured,
     configured_or_reference,
     need_extra,
+    reading_or_writing,
+    report,
 )
-from soilbus.files import whole_file
+from soilbus.files import whole_file, write_text
 from soilbus.process import say
 
 if TYPE_CHECKING:
@@ -99,8 +101,7 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     if found is None:
         return ""
     if args.manoeuvre_out is not None:
-        with whole_file(args.manoeuvre_out) as out:
-            out.write(json.dumps(found[0].as_json(), indent=1) + "\n")
+        write_text(args.manoeuvre_out, json.dumps(found[0].as_json(), indent=1) + "\n")
     return "\n".join(excitation_lines(*found, now, config)) + "\n"
 
 
@@ -108,12 +109,8 @@ def _write_frames(args: argparse.Namespace, config: Config) -> None:
     from soilbus.can.log_writer import write_log
     from soilbus.offline.sent_frames import sent_frames
 
-    try:
+    with reading_or_writing(args.frames):
         write_log(sent_frames(config, args.logs), args.frames)
-    except OSError as error:
-        raise WorkError(f"{args.frames}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise WorkError(f"{args.frames}: {error}") from None
 
 
 def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
@@ -159,8 +156,7 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     if args.report is not None:
         from soilbus.report.replay import replay_report
 
-        with whole_file(args.report) as out:
-            out.write(replay_report(results, text, _source(args, config)))
+        write_text(args.report, replay_report(results, text, _source(args, config)))
     if args.table is not None:
         write_table(args.table, results, config)
     if args.mcap is not None:
@@ -170,8 +166,7 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
         if args.map.suffix == ".gpkg":
             write_geopackage(args.map, map_text)
         else:
-            with whole_file(args.map) as out:
-                out.write(map_text)
+            write_text(args.map, map_text)
         if left_out:
             say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
@@ -229,7 +224,7 @@ def simulate(args: argparse.Namespace) -> None:
         scenario = scenario_over(
             args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
         )
-        if _nothing_towed(config) and args.slope:
+        if config.tows_nothing and args.slope:
             scenario = replace(scenario, slip=None)  # which would make slopes of its own
         if args.manoeuvre is not None:
             scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
@@ -245,17 +240,9 @@ def _of_manoeuvre(path: Path, scenario: Scenario, config: Config) -> Scenario:
     from soilbus.files import read_bounded
     from soilbus.simulator.manoeuvre import LARGEST, of_json
 
-    try:
+    with reading_or_writing(path):
         manoeuvre = of_json(read_bounded(path, LARGEST).decode())
-    except OSError as error:
-        raise WorkError(f"{path}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise WorkError(f"{path}: {error}") from None
-    return manoeuvre.over(scenario, _nothing_towed(config))
-
-
-def _nothing_towed(config: Config) -> bool:
-    return config.vehicle is not None and config.vehicle.towing == "never"
+    return manoeuvre.over(scenario, config.tows_nothing)
 
 
 def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
@@ -297,7 +284,7 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
 
 def effects(args: argparse.Namespace) -> None:
     """`soilbus effects`: the catalogue."""
-    from soilbus.cli.effects import effect_text, effects_json, overview
+    from soilbus.cli.effects import effect_records, effect_text, overview
     from soilbus.config.model import ConfigError
     from soilbus.terra.effects.catalogue import CATALOGUE
     from soilbus.words import did_you_mean
@@ -305,11 +292,7 @@ def effects(args: argparse.Namespace) -> None:
     if args.name is not None and args.name not in CATALOGUE:
         raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
     wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
-    if args.json is not None:
-        with whole_file(args.json) as out:
-            out.write(effects_json(wanted) + "\n")
-    if str(args.json) != "-":
-        print(effect_text(wanted[0]) if args.name else overview(wanted), end="")
+    report(args.json, effect_records(wanted), effect_text(wanted[0]) if args.name else overview(wanted))
 
 
 def diagnose(args: argparse.Namespace) -> None:
@@ -351,8 +334,7 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.manoeuvre_out is not None and findings.plan is not None:
         texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
-        with whole_file(path) as out:
-            out.write(text)
+        write_text(path, text)
     if all(str(path) != "-" for path, _ in texts):
         print(findings_text(findings), end="")
     if args.manoeuvre_out is not None and findings.plan is None:

@@ -9,7 +9,7 @@ import argparse
 import os
 from contextlib import nullcontext
 
-from soilbus.cli.common import WorkError, configured, configured_or_reference, need_extra
+from soilbus.cli.common import WorkError, configured, configured_or_reference, need_extra, report
 from soilbus.files import whole_file
 
 
@@ -22,8 +22,6 @@ def paper(args: argparse.Namespace) -> None:
 
 def montecarlo(args: argparse.Namespace) -> None:
     """`soilbus montecarlo`: errors of simulated windows beside the Cramér-Rao bound."""
-    import json
-
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.reference import reference_configuration
     from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, as_json, monte_carlo, processes
@@ -32,21 +30,17 @@ def montecarlo(args: argparse.Namespace) -> None:
     config = configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
     try:
         with processes(os.cpu_count() or 1) as each:
-            more = {"posterior_samples": args.exact, "around": args.around}
-            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, **more)))
+            drawn = monte_carlo(
+                config, args.windows, args.seed, each=each, posterior_samples=args.exact, around=args.around
+            )
+            cells = list(with_progress(drawn))
     except SimulationError as error:
         raise WorkError(str(error)) from None
-    if args.json is not None:
-        with whole_file(args.json) as out:
-            out.write(json.dumps([as_json(cell) for cell in cells], indent=1) + "\n")
-    if str(args.json) != "-":
-        print(monte_carlo_report(cells), end="")
+    report(args.json, [as_json(cell) for cell in cells], monte_carlo_report(cells))
 
 
 def decisions(args: argparse.Namespace) -> None:
     """`soilbus decisions`: predictions beside what simulated drives then do."""
-    import json
-
     from soilbus.config.model import ConfigError
     from soilbus.simulator.drive import SimulationError
     from soilbus.validation.bogging_trials import warning_trials
@@ -56,7 +50,7 @@ def decisions(args: argparse.Namespace) -> None:
     from soilbus.validation.verdict_trials import verdict_trials
 
     config = configured_or_reference(args)
-    if config.vehicle is not None and config.vehicle.towing == "never":
+    if config.tows_nothing:
         raise ConfigError(['vehicle.towing = "never": decisions are tried by drafts, which this vehicle never has'])
     try:
         with processes(os.cpu_count() or 1) as each:
@@ -65,11 +59,7 @@ def decisions(args: argparse.Namespace) -> None:
             warnings = warning_trials(config, args.boggings, args.hours, args.seed, each=each)
     except SimulationError as error:
         raise WorkError(str(error)) from None
-    if args.json is not None:
-        with whole_file(args.json) as out:
-            out.write(json.dumps(as_json(drafts, calls, warnings), indent=1) + "\n")
-    if str(args.json) != "-":
-        print(decisions_report(drafts, calls, warnings), end="")
+    report(args.json, as_json(drafts, calls, warnings), decisions_report(drafts, calls, warnings))
 
 
 def bench(args: argparse.Namespace) -> None:

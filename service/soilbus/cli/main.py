@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _StandardError(logging.Handler):
-    """The journal, or the terminal: whatever standard error is at the time."""
+    """The journal or the terminal: standard error as it is at the time."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """One line."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
 from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
-from soilbus.files import whole_file
+from soilbus.files import write_text
 from soilbus.process import ENDING, say
 
 if TYPE_CHECKING:
@@ -67,8 +67,7 @@ def init(args: argparse.Namespace) -> None:
     files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
     words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
     made = proposal(database, assigned(found), facts, files, " ".join(words))
-    with whole_file(args.out) as out:
-        out.write(made.text)
+    write_text(args.out, made.text)
     log = f" --log {args.log}" if args.log else ""
     say(
         f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then'

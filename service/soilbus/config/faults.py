@@ -191,11 +191,11 @@ def _choices(location: Sequence[Any]) -> list[Any]:
     """The values that the key at this location may have."""
     model = _model_at(location[:-1])
     field = model.model_fields.get(str(location[-1])) if model is not None else None
-    return [] if field is None else [v for kind in _parts(field.annotation) for v in _literals(kind)]
-
-
-def _literals(kind: Any) -> tuple[Any, ...]:
-    return get_args(kind) if get_origin(kind) is Literal else ()
+    return (
+        []
+        if field is None
+        else [v for kind in _parts(field.annotation) if get_origin(kind) is Literal for v in get_args(kind)]
+    )
 
 
 def _model_at(location: Sequence[Any]) -> type[BaseModel] | None:

@@ -25,6 +25,7 @@ from pydantic import (
     model_validator,
 )
 
+from soilbus.grouping import grouped
 from soilbus.words import did_you_mean
 
 __all__ = [
@@ -64,7 +65,7 @@ SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; `faults` holds one line for each fault, whatever the names in it hold."""
+    """The configuration cannot be used; `faults` holds one line for each fault, without line breaks of names."""
 
     def __init__(self, faults: Iterable[str]) -> None:
         self.faults = [_printable(fault) for fault in faults]
@@ -167,29 +168,22 @@ class Dbc(_Section):
 
 
 class Signal(_Section):
-    """Where a role's value comes from: "Message.Signal", or a table with more to say.
-
-    `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
-    signal of the same message) that must hold one of `valid_values` for the value to
-    count.  `at` is the side of the gear on which a torque or speed is measured.
-    `timeout` [s] is the age from which the channel counts as stale.  `delay` [s] is how much
-    earlier what a sample reports was true: a radar's filter, a receiver's solution, a queue.
-    """
+    """Where a role's value comes from: "Message.Signal", or a table with more to say."""
 
     signal: SignalName
     """`Message.Signal` of the DBC."""
     sign: Literal[1, -1] = 1
     """-1 for a sensor mounted the other way round."""
     at: Literal["wheel", "shaft"] | None = None
-    """Side of the gear on which it is measured."""
+    """Side of the gear on which a torque or speed is measured."""
     valid: str | None = None
-    """Signal that must hold one of `valid_values` for the value to count."""
+    """Signal, of the same message or another, that must hold one of `valid_values` for the value to count."""
     valid_values: list[int] = Field(default_factory=lambda: [1])
     """See `valid`."""
     timeout: PositiveFloat | None = None
     """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
-    """How much earlier what a sample reports was true [s]: a filter, a receiver, a queue."""
+    """How much earlier what a sample reports was true [s]: a radar's filter, a receiver's solution, a queue."""
     torque_constant: PositiveFloat | None = None
     """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
     reference_torque: PositiveFloat | None = None
@@ -313,12 +307,7 @@ class Axle(_Section):
 
 
 class Wheel(_Section):
-    """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
-
-    `max_torque` [N m] is the motor's limit at the wheel where no signal reports it.  Only the
-    wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
-    Of the wheels of an axle, the left one stands first.
-    """
+    """One wheel and its sensors; only the wheel of a test rig has no axle, and of an axle the left one stands first."""
 
     name: Name
     """For messages, JSON and frames: FL, FR, RL, RR on a tractor."""
@@ -610,6 +599,14 @@ class NoiseOfChannels(_Section):
             raise ValueError("a fixed gain error of this sensor is not estimated: say it in absolute or relative")
         return noise
 
+    def scaled(self, factor: float, *parts: str) -> NoiseOfChannels:
+        """With these parts (by default all) of each channel's noise times a factor, which may be 0."""
+        noises = {name: getattr(self, name) for name in type(self).model_fields}
+        return self.model_copy(update={
+            name: noise.model_copy(update={part: factor * getattr(noise, part) for part in parts or Noise.model_fields})
+            for name, noise in noises.items()
+        })  # fmt: skip
+
 
 class Prior(_Section):
     """What is known of a soil parameter beforehand; std = 0 holds it at value."""
@@ -765,7 +762,7 @@ class Traversability(_Section):
 
 
 class Warning(_Section):
-    """When soilbus warns of immobilisation from slip and speed alone, whatever soil it is.
+    """When soilbus warns of immobilisation from slip and speed alone, without any estimate of the soil.
 
     Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
     thesis, 2023, ch. 7), with eleven others looked at: `python -m soilbus.validation.snow`.
@@ -955,7 +952,7 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _tracks_as_wheels(self) -> Config:
-        """`wheel` holds the tracks, too, behind the wheels: whatever runs on the ground."""
+        """`wheel` holds the tracks, too, behind the wheels: all that runs on the ground."""
         if self.track and (self.wheel or len(self.track) == 1) and any(t.axle is None for t in self.track):
             raise ValueError("a [[track]] beside [[wheel]]s, or alone, needs its axle")
         if len({t.rollers for t in self.track}) > 1:
@@ -971,6 +968,11 @@ class Config(_Section):
     def rollers(self) -> int:
         """Periods of the pressure along each track's contact; 0: uniform."""
         return self.track[0].rollers if self.track else 0
+
+    @property
+    def tows_nothing(self) -> bool:
+        """Whether nothing is ever towed."""
+        return self.vehicle is not None and self.vehicle.towing == "never"
 
     @property
     def on_tracks(self) -> bool:
@@ -991,7 +993,7 @@ class Config(_Section):
                 raise ValueError(f"wheel {w.name}: axle: missing")
         for fault in self._faults_of_axles():
             raise ValueError(fault)
-        if self.vehicle is not None and self.vehicle.towing == "never" and self.signals.draft is not None:
+        if self.tows_nothing and self.signals.draft is not None:
             raise ValueError("vehicle.towing = never, but signals.draft is mapped: leave out one of the two")
         return self
 
@@ -1030,11 +1032,8 @@ class Config(_Section):
 
     def same_signal(self, role: str) -> list[list[Wheel]]:
         """The wheels that have a role (torque, speed, load), those on one and the same signal together."""
-        groups: dict[str, list[Wheel]] = {}
-        for wheel in self.wheel:
-            if (mapped := getattr(wheel, role)) is not None:
-                groups.setdefault(mapped.signal, []).append(wheel)
-        return list(groups.values())
+        mapped = [wheel for wheel in self.wheel if getattr(wheel, role) is not None]
+        return list(grouped(mapped, lambda wheel: getattr(wheel, role).signal).values())
 
     @property
     def soil_prior(self) -> dict[str, Prior]:

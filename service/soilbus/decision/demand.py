@@ -50,11 +50,8 @@ def present_demand(
     recent = known & (window.t > window.t[-1] - hop)
     if not recent.any():
         return None
-    return max((_over(window.rows(np.flatnonzero(part)), chassis, gain) for part in (recent, known)), key=_pull)
-
-
-def _pull(demand: Demand) -> float:
-    return demand.pull
+    demands = (_over(window.rows(np.flatnonzero(part)), chassis, gain) for part in (recent, known))
+    return max(demands, key=lambda demand: demand.pull)
 
 
 def _over(window: Window, chassis: Chassis, gain: Estimate) -> Demand:

@@ -172,22 +172,15 @@ class Demand(NamedTuple):
         change = None if earlier is None or earliest is None else (value - 2.0 * earlier + earliest) ** 2
         return Demand(*later(self, step, (value, change), (options.demand_memory, options.scatter_memory)))
 
-    def swing_std(self, options: WatchOptions = WATCH) -> float:
-        """Standard deviation [N] of the swing; inf where it is not known.
+    def slope_std(self, line: Line, options: WatchOptions = WATCH) -> float:
+        """Upper bound of the standard deviation of the line's slope [N/s]: values within `swing_time` count as one.
 
         The second difference of uncorrelated values has six times their variance.
         """
-        return math.sqrt(_estimated(self.swing, self._in_swing(options)) / 6.0)
-
-    def slope_std(self, line: Line, options: WatchOptions = WATCH) -> float:
-        """Upper bound of the standard deviation of the line's slope [N/s]: values within `swing_time` count as one."""
         if line.spread <= 0.0:
             return math.inf
-        return self.swing_std(options) * math.sqrt(self._in_swing(options) / line.spread)
-
-    def _in_swing(self, options: WatchOptions) -> float:
-        """Number of values within `swing_time`."""
-        return options.swing_time / options.demand_memory * self.trend.n
+        in_swing = options.swing_time / options.demand_memory * self.trend.n
+        return math.sqrt(_estimated(self.swing, in_swing) / 6.0) * math.sqrt(in_swing / line.spread)
 
 
 class Peaks(NamedTuple):
@@ -383,7 +376,7 @@ def has_cause(watch: Watch, loss: TractionLoss, hold: float) -> bool:
 
 
 def ended(watch: Watch) -> Watch:
-    """The watch after a decision is go: a warning that only lasts is over, and begins anew with a new cause only."""
+    """The watch after a decision is go: a warning without a cause is over, and only a new cause begins another."""
     return watch._replace(caused=-math.inf, warning=Alert.NONE)
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
-from soilbus.decision.options import WATCH, WatchOptions
+from soilbus.decision.options import WATCH
 from soilbus.decision.stall_forecast import LONGEST_GAP, Sample, StallForecast, forecast
 from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 from soilbus.estimation.posterior import Estimate
@@ -293,9 +293,9 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     return found[0] if found else None
 
 
-def bins_of_a_moment(bin_length: float, options: WatchOptions = WATCH) -> int:
+def bins_of_a_moment(bin_length: float) -> int:
     """Number of bins of a length [s] over which a moment's means go."""
-    return max(round(options.moment_span / bin_length), 1)
+    return max(round(WATCH.moment_span / bin_length), 1)
 
 
 def motions(

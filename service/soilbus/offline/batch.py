@@ -2,11 +2,10 @@
 
     LOG...  ->  jobs  ->  parts/DIGEST.gz (one a log)  ->  windows, summaries, errors, map
 
-Only logs that have no part yet are replayed, so a run that was stopped, whatever stopped it, loses the logs in work
-and no more.  What is wrong with a log is kept as well, and beside both the state of its file (parts/DIGEST.kept): a
-log whose file changed is read again.  Workers need neither the configuration nor the DBC files nor the output folder:
-settings travel with a job, and parts come back.  Workers open a log by its path or URL; where they do not see the path,
-it is sent along.
+Only logs that have no part yet are replayed, so a run that is stopped loses only the logs in work. The fault of a log
+is kept as well, and beside both the state of its file (parts/DIGEST.kept): a log whose file changed is read again.
+Workers need neither the configuration nor the DBC files nor the output folder: settings travel with a job, and parts
+come back. Workers open a log by its path or URL; where they do not see the path, it is sent along.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from typing import Any
 
 from soilbus import __version__
 from soilbus.config.model import ConfigError
+from soilbus.grouping import grouped
 from soilbus.offline import dataset
 from soilbus.offline.fleet import (
     Given,
@@ -547,13 +547,10 @@ def _diagnose_all(
     retry: bool,
 ) -> dict[str, Any]:
     """Findings of every vehicle, kept one by one, those of each type together, and the fleet's diagnosis of them."""
-    groups: dict[tuple[str, str], list[Job]] = {}
-    for job in sorted(jobs, key=lambda job: (summaries.get(job.digest, {}).get("begin") or 0, job.log)):
-        if job.digest in summaries:
-            groups.setdefault((job.setup.digest, job.vehicle), []).append(job)
-    types: dict[str, list[list[Job]]] = {}
-    for (setup, _), group in sorted(groups.items()):
-        types.setdefault(setup, []).append(chosen(group))
+    read = [job for job in jobs if job.digest in summaries]
+    read.sort(key=lambda job: (summaries[job.digest].get("begin") or 0, job.log))
+    of_vehicles = grouped(read, lambda job: (job.setup.digest, job.vehicle))
+    types = grouped((chosen(group) for _, group in sorted(of_vehicles.items())), lambda group: group[0].setup.digest)
     found = [
         findings_of_type(
             vehicles[0][0].setup,

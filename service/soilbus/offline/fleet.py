@@ -24,6 +24,7 @@ from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.offline.parts import Job, Setup, check_version, local_log, unpacked
 from soilbus.offline.recordings import recordings_of
 from soilbus.offline.replay import LogError
+from soilbus.pipeline.outputs import values_std
 from soilbus.terra.effects.effect import Effect
 from soilbus.words import one_line
 
@@ -93,7 +94,7 @@ def findings_of(jobs: Sequence[Job], version: str, given: Given) -> dict[str, An
     }
     values = diagnosis.completed.parameters()
     record["places"] = found.places
-    record["parameters"] = {name: _estimates(values.get(name, {})) for name in by_name(found.places)}
+    record["parameters"] = {name: values_std(values.get(name, {})) for name in by_name(found.places)}
     record["onsets"] = {name: _onset(onset, record["logs"]) for name, onset in found.onsets.items()}
     record["factors"] = {name: _plain(factor) for name, factor in found.factors.items()}
     return record
@@ -175,7 +176,7 @@ def findings_of_type(
                 "name": one.effect.name,
                 "scope": "type",
                 "probability": one.probability,
-                "parameters": _estimates(_with_wheels(one.parameters, [wheel.name for wheel in config.wheel])),
+                "parameters": values_std(_with_wheels(one.parameters, [wheel.name for wheel in config.wheel])),
                 "agreeing": [findings[v]["vehicle"] for v in one.vehicles],
             }
             for one in shared
@@ -202,7 +203,7 @@ def _onset(onset: Onset, logs: Sequence[str]) -> dict[str, Any]:
         "log": logs[onset.first],
         "probability": onset.probabilities[onset.first],
         "never": onset.never,
-        "by_log": [{"log": log, "probability": p, "parameters": _estimates(s or {})} for log, p, s in by_log],
+        "by_log": [{"log": log, "probability": p, "parameters": values_std(s or {})} for log, p, s in by_log],
     }
 
 
@@ -210,10 +211,6 @@ def no_findings(vehicle: str, fault: str) -> dict[str, Any]:
     """Findings of a vehicle that cannot be diagnosed, and why."""
     nothing: dict[str, Any] = {"places": [], "parameters": {}, "onsets": {}, "factors": {}}
     return {"vehicle": vehicle, "logs": [], "left_out": [], "verdict": None, "fault": fault} | nothing
-
-
-def _estimates(values: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    return {name: {"value": each.value, "std": each.std} for name, each in values.items()}
 
 
 def judged(types: Sequence[dict[str, Any]], findings: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from soilbus.config.model import Config, Noise
+from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.options import DEFAULT
 from soilbus.diagnosis.records import Record, TooLittle, record_of
@@ -241,17 +241,10 @@ def _separations(
 
 def _noise_free(config: Config, manoeuvre: Manoeuvre, truth: Truth) -> ObservationModelWithEffects | None:
     """The manoeuvre as a rival predicts it; None where it cannot be driven."""
-    quiet = {name: Noise.model_construct(absolute=0.0, relative=0.0, of_mean=0.0, gain=0.0) for name in
-             type(config.noise).model_fields}  # fmt: skip
-    silent = config.model_copy(
-        update={
-            "noise": config.noise.model_copy(update=quiet),
-            "model": config.model.model_copy(update={"effects": []}),
-        }
-    )
-    nothing_towed = config.vehicle is not None and config.vehicle.towing == "never"
+    no_effects = config.model.model_copy(update={"effects": []})
+    silent = config.model_copy(update={"noise": config.noise.scaled(0.0), "model": no_effects})
     ground = Scenario(manoeuvre.duration, (Patch(0.0, "the soil found", truth.soil),), slip_spread=0.0)
-    scenario = manoeuvre.over(ground, nothing_towed)
+    scenario = manoeuvre.over(ground, config.tows_nothing)
     try:
         recording = simulate(silent, scenario, 0, truth.effects)
         if recording.bogged_at is not None or _beyond_motors(recording, config):

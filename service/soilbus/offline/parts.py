@@ -40,13 +40,9 @@ from soilbus.offline.replay import LogError, OtherBus, replay
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import flat_record, window_record
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.pipeline.result import WindowResult
+from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.words import one_line
 
-EARLIEST_DATE = 946684800.0
-"""1 January 2000 [s]: smaller stamps count from the start of a log or of a logger, and are no dates."""
-LATEST_DATE = 4102444800.0
-"""1 January 2100 [s]."""
 MISSING = "no such file"
 
 
@@ -217,7 +213,7 @@ def unpacked(content: bytes) -> tuple[Config, Database | None]:
 
 
 def part_of(job: Job, version: str) -> Outcome:
-    """Replay one log; whatever is wrong with it is in the outcome.
+    """Replay one log; its fault, if it has one, is in the outcome.
 
     Parameters
     ----------
@@ -358,7 +354,7 @@ class _Summary:
         if self._shift is None:
             self._shift = 0.0 if self.job.start is None else self.job.start - (t - self.config.estimator.window)
         t += self._shift
-        return round(t * 1e3) if EARLIEST_DATE <= t < LATEST_DATE else None
+        return round(t * 1e3) if is_date(t) else None
 
     def record(self, pipeline: Pipeline | None, fault: str | None) -> dict[str, Any]:
         """The whole log in one row, with the names of its windows' columns."""

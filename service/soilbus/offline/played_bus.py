@@ -25,8 +25,8 @@ LEAST_WAIT = 1e-4
 class PlayedClock:
     """Monotonic time [s] that passes only when somebody waits."""
 
-    def __init__(self, now: float = 1000.0) -> None:
-        self.now = now
+    def __init__(self) -> None:
+        self.now = 1000.0
 
     def __call__(self) -> float:
         return self.now

@@ -2,8 +2,8 @@
 
     log -> PlayedBus -> Service (daemon) -> frames stamped with the recording's time
 
-Nothing of what is sent when is written here: the loop, the schedule, counters and checksums are the daemon's. Windows
-are solved in no time; a real service sends the frames of a hop later by that time. Frames of soilbus itself in the
+Loop, schedule, counters and checksums are the daemon's. Solving a window takes no time of the recording; a real service
+sends the frames of a hop later by that time. Frames of soilbus itself in the
 recording are left out.
 """
 

@@ -29,7 +29,6 @@ from soilbus.offline.recordings import Recordings
 from soilbus.offline.replay import LogError, log_names
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask, column_means
-from soilbus.pipeline.positions import PositionTrack
 from soilbus.pipeline.result import WindowResult
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import for_wheel
@@ -154,10 +153,7 @@ def _task(index: int, run: Run, rig: Rig) -> WindowTask:
         end=float(window.t[-1]),
         window=window,
         slip=dict(zip(rig.wheels, column_means(slip), strict=True)),
-        missing=(),
-        poor=(),
         torque_limit=np.full(len(rig.wheels), math.nan),
-        track=PositionTrack({}),
         rejected=run.rejected,
         fresh=True,
     )

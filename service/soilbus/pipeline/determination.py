@@ -5,8 +5,9 @@
                  tau = c + p tan phi at the contact's own pressure p = W / (b l)
 
 Below a wheel pressure rises from 0 at the edge of the contact to its sinkage: all depths from 0 to there carry load.
-A track presses evenly, so only the depth of its rut does, and at any other one the soil is not asked.  A machine that
-presses with one pressure shows tau alone, which is all that its thrust needs, and not c and tan phi apart.
+A track presses evenly, so only the depth of its rut carries load, and the window says nothing of other depths.  A
+machine that presses with one pressure determines tau alone, which is all that its thrust depends on, and not c and
+tan phi apart.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ from soilbus.estimation.assembly import effects_and_parameters_of, form_of, mode
 from soilbus.estimation.measurements import gain_names
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
-from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
+from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
@@ -150,8 +150,11 @@ class WindowEstimator:
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
-        own = None if fit is None or status is Status.INVALID else self._widened_posterior(tracked, fit)
-        posterior = None if own is None or fit is None else _with_form(own, fit, self.prior)
+        own = posterior = None
+        if fit is not None and status is not Status.INVALID:
+            own = posterior = fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
+            if fit.form is not None:
+                posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
         basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
@@ -283,10 +286,6 @@ class WindowEstimator:
             self.model, *self._effects_and_parameters, fit.reported, len(self.rig.wheels), speed, widening, fit.form
         )
 
-    def _widened_posterior(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
-        """The reported posterior (of both modes), widened by chi-square where the window does not fit."""
-        return fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
-
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
         """Gain error of the draft sensor: posterior of the fit, else the prior."""
         if tracked.fit is None or tracked.mismatch:
@@ -396,11 +395,6 @@ def _gated(tracked: TrackerOutput) -> str:
 def _widening(tracked: TrackerOutput, fit: Fit) -> float:
     """Factor of a fit's covariance: its reduced chi-square where the window does not fit, else 1."""
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
-
-
-def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
-    """A posterior with the second moments due to the model's form added, about the same soil."""
-    return own if fit.form is None else own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

@@ -82,12 +82,12 @@ class WindowTask:
     end: float
     window: Window
     slip: dict[str, float | None]
-    missing: tuple[str, ...]
-    poor: tuple[str, ...]
     torque_limit: Array
-    track: PositionTrack
-    rejected: dict[str, int]
     fresh: bool
+    missing: tuple[str, ...] = ()
+    poor: tuple[str, ...] = ()
+    track: PositionTrack = field(default_factory=lambda: PositionTrack({}))
+    rejected: dict[str, int] = field(default_factory=dict)
     implausible: tuple[str, ...] = ()
     late: float = 0.0
     epoch: int = 0

@@ -40,6 +40,8 @@ __all__ = [
     "known",
     "likeliest",
     "slip_frames",
+    "value_std",
+    "values_std",
     "window_record",
 ]
 
@@ -110,7 +112,7 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
     bearing = {
         "z_ref": config.estimator.z_ref,
         "b_ref": config.estimator.b_ref,
-        **_value_std(result.bearing),
+        **value_std(result.bearing),
         "z_driven": None if result.z_driven is None else list(result.z_driven),
         "extrapolates": _extrapolates(result, config.estimator.z_ref),
     }
@@ -122,7 +124,7 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
         "status": str(result.status),
         "state": str(state_after(result)),
         "reason": result.reason,
-        "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
+        "soil": None if posterior is None else values_std(posterior.parameters()),
         "bearing_pressure": bearing,
         "soil_change": None if result.soil_change is None else result.soil_change._asdict(),
         "soil_class": None if result.soil_class is None else likeliest(result.soil_class),
@@ -133,8 +135,8 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
             "probability": decision.probability,
             "torque_required": decision.torque_required,
             "torque_available": decision.torque_available,
-            "max_draft": _value_std(decision.max_draft),
-            "max_grade": _value_std(decision.max_grade),
+            "max_draft": value_std(decision.max_draft),
+            "max_grade": value_std(decision.max_grade),
             "limit": decision.limit,
             "age": result.t - result.basis.end,
             "since_valid": decision.since_valid,
@@ -216,18 +218,18 @@ def _capability(capability: Capability) -> dict[str, Any]:
     """The parts of the capability that `traversability` does not hold."""
     forecast = capability.forecast
     return {
-        "max_draft_here": _value_std(capability.max_draft_here),
-        "max_grade_with_draft": _value_std(capability.max_grade_with_draft),
+        "max_draft_here": value_std(capability.max_draft_here),
+        "max_grade_with_draft": value_std(capability.max_grade_with_draft),
         "set_points": {
-            axle: {"efficiency": _value_std(point.efficiency), "pull": _value_std(point.pull)}
+            axle: {"efficiency": value_std(point.efficiency), "pull": value_std(point.pull)}
             for axle, point in capability.set_points.items()
         },
         "forecast": None
         if forecast is None
         else {
-            "slip": _value_std(forecast.slip),
-            "torque": _value_std(forecast.torque),
-            "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
+            "slip": value_std(forecast.slip),
+            "torque": value_std(forecast.torque),
+            "sinkage": values_std(forecast.sinkage),
         },
         "over_slip": {
             column: getattr(capability.over_slip, column).tolist()
@@ -242,8 +244,14 @@ def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
     return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
 
 
-def _value_std(estimate: Estimate | None) -> dict[str, float | None]:
+def value_std(estimate: Estimate | None) -> dict[str, float | None]:
+    """A value with its standard deviation, for JSON; None where not known."""
     return {"value": None, "std": None} if estimate is None else {"value": estimate.value, "std": estimate.std}
+
+
+def values_std(estimates: Mapping[str, Estimate]) -> dict[str, dict[str, float | None]]:
+    """The same of several, by name."""
+    return {name: value_std(estimate) for name, estimate in estimates.items()}
 
 
 def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -327,7 +335,7 @@ def known(value: Any) -> Any:
     """Nested dicts, lists and numbers for JSON: None instead of every number that is not finite."""
     if isinstance(value, Mapping):
         return {key: known(each) for key, each in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [known(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 

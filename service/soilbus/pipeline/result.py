@@ -23,6 +23,15 @@ if TYPE_CHECKING:
     from soilbus.estimation.posterior import Estimate, Posterior
 
 
+FIRST_DATE, LAST_DATE = 946684800.0, 4102444800.0
+"""1 January of 2000 and of 2100 [s]: other stamps count from the start of a log or of a logger, and are no dates."""
+
+
+def is_date(t: float) -> bool:
+    """Whether a stamp [s] is a time of day, not seconds from some start."""
+    return FIRST_DATE <= t < LAST_DATE
+
+
 class SoilChange(NamedTuple):
     """Which soil a window is of (`tracker.TrackerState`), and why (`tracker.Reason`).
 
@@ -127,7 +136,7 @@ class WindowResult:
         return able.over_slip if able is not None and fits else None
 
 
-def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:
+def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool) -> WindowResult:
     """The result at a later time.
 
     Parameters

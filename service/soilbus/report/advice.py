@@ -105,5 +105,5 @@ def _typical(of: Sequence[tuple[float | None, float | None]]) -> _Spread | None:
 
 
 def of_use(windows: Sequence[WindowResult]) -> list[WindowResult]:
-    """Those with an estimate of the soil, whatever its status."""
+    """Those with an estimate of the soil, of any status."""
     return [window for window in windows if window.status is not Status.INVALID and window.posterior is not None]

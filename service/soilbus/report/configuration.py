@@ -25,7 +25,6 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.modelled_drive import modelled_drive
 from soilbus.pipeline.outputs import check_cycle_times
-from soilbus.pipeline.positions import PositionTrack
 from soilbus.report.proposal import BEARING_STD_WITHOUT_CELLS
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
@@ -279,8 +278,8 @@ def _expected(config: Config) -> tuple[float, float] | None:
     count = np.isfinite(mean) * s.bin * SAMPLES_PER_SECOND
     window = completed(made_window(NoiseTable.of(rig), t, mean, count, int(count.sum())), rig)
     task = WindowTask(
-        index=0, start=0.0, end=s.window, window=window, slip=dict.fromkeys(rig.wheels), missing=(), poor=(),
-        torque_limit=np.full(len(rig.wheels), np.nan), track=PositionTrack({}), rejected={}, fresh=True,
+        index=0, start=0.0, end=s.window, window=window, slip=dict.fromkeys(rig.wheels),
+        torque_limit=np.full(len(rig.wheels), np.nan), fresh=True,
     )  # fmt: skip
     posterior = estimator.estimate(task).result.posterior
     if posterior is None:

@@ -54,8 +54,8 @@ COLOURS = {
     "unknown": ("#000000", "#d0d0d0"),
     "gone": ("#ffffff", "#303030"),
 }
-"""Foreground and background by kind of verdict: of the fixed colours of a 256-colour terminal, as the first 16 are
-whatever its theme makes of them; contrast by WCAG 2 above 7 (level AAA)."""
+"""Foreground and background by kind of verdict: of the fixed colours of a 256-colour terminal, as its theme sets
+the first 16; contrast by WCAG 2 above 7 (level AAA)."""
 REASONS = {
     "bus_down": ("the bus is down", "Check the CAN connection"),
     "bus_error": ("the bus has errors", "Check the CAN connection"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, Series
 from soilbus.estimation.posterior import Estimate
+from soilbus.grouping import grouped
 from soilbus.offline.diagnose import Findings
 from soilbus.report.page import Picture, picture
 
@@ -101,7 +103,10 @@ def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Pictur
         difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
         typical = float(np.sqrt(np.mean(difference**2)))
         caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
-        yield caption[0].upper() + caption[1:], _agreement_picture(of, series, scales, f"{when}{name}")
+        yield (
+            caption[0].upper() + caption[1:],
+            picture(partial(_draw_agreement, of=of, series=series, scales=scales), 4.6, f"{when}{name}"),
+        )
 
 
 class _Scales(NamedTuple):
@@ -130,10 +135,6 @@ def _ends(values: Array) -> tuple[float, float]:
     low, high = np.percentile(values, (100.0 - POINTS_SHOWN, POINTS_SHOWN)).tolist()
     space = 0.05 * (high - low) or 1.0
     return low - space, high + space
-
-
-def _agreement_picture(of: Agreement, series: Sequence[Series], scales: _Scales, words: str) -> Picture:
-    return picture(lambda figure: _draw_agreement(figure, of, series, scales), 4.6, words)
 
 
 def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales: _Scales) -> None:
@@ -167,15 +168,13 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales
 
 def channel_gaps(fitted: FittedModel) -> dict[str, float]:
     """Mean square of the standardised residuals of each channel's held-out readings; 1 is noise."""
-    found: dict[str, list[Array]] = {}
-    for series in fitted.held_out_series():
-        found.setdefault(series.channel, []).append(series.standardised)
-    return {channel: float(np.mean(np.concatenate(parts) ** 2)) for channel, parts in found.items()}
+    found = grouped(fitted.held_out_series(), lambda series: series.channel)
+    return {c: float(np.mean(np.concatenate([part.standardised for part in of]) ** 2)) for c, of in found.items()}
 
 
 def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
     """Root of the gap of each channel, before and after, as bars."""
-    models = _before_and_after(base, completed)
+    models = {"before": base} if base is completed else {"before": base, "after": completed}
     bars = {when: {c: gap**0.5 for c, gap in channel_gaps(model).items()} for when, model in models.items()}
     words = "; ".join(
         " ".join([when, *(f"{channel} {size:.2f}" for channel, size in of.items())]).strip()
@@ -183,11 +182,6 @@ def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
     )
     height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
     return picture(lambda figure: _draw_gaps(figure, bars), height, f"error of the model over noise: {words}")
-
-
-def _before_and_after(before: FittedModel, after: FittedModel) -> dict[str, FittedModel]:
-    """Both by name, or what was before alone where nothing was added."""
-    return {"before": before} if before is after else {"before": before, "after": after}
 
 
 def _bars(
@@ -276,9 +270,7 @@ def _draw_drafts(
 
 def residual_picture(fitted: FittedModel, title: str) -> Picture:
     """Standardised residuals by channel (rows) over slip, load and time (columns)."""
-    channels: dict[str, list[Series]] = {}
-    for series in fitted.held_out_series():
-        channels.setdefault(series.channel, []).append(series)
+    channels = grouped(fitted.held_out_series(), lambda series: series.channel)
     return picture(
         lambda figure: _draw_residuals(figure, channels, title),
         0.6 + 2.2 * len(channels),

@@ -165,18 +165,18 @@ def _limits(dashboard: Dashboard) -> list[Text]:
 
 def _slope(known: ReceivedFrames, message: str) -> Text:
     angle, spread = known.number(message, "MaxGrade"), known.number(message, "MaxGradeStd")
-    style = "" if known.is_valid(message) else "dim"
     if angle is None or spread is None or abs(angle) >= math.pi / 2.0:
-        return Text("-", style=style)
+        return _cell(known, message, None)
     slope = math.tan(angle)
-    return Text(_figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)), style=style)
+    return _cell(known, message, _figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)))
 
 
 def _advice(dashboard: Dashboard) -> list[Text]:
     known = dashboard.known
-    rows: list[Row] = []
-    for name, signal in (("efficiency", "SlipForEfficiency"), ("most pull", "SlipForPull")):
-        rows.append((name, *(_percent(known, "TractionAdvice", f"{signal}{axle}") for axle in ("Front", "Rear"))))
+    rows: list[Row] = [
+        (name, *(_one(known, "TractionAdvice", f"SlipFor{kind}{axle}", "{:.0f}", 0.01) for axle in ("Front", "Rear")))
+        for name, kind in (("efficiency", "Efficiency"), ("most pull", "Pull"))
+    ]
     return grid(("best slip, %, for", "front", "rear"), *rows)
 
 
@@ -269,20 +269,19 @@ def _measured(known: ReceivedFrames, message: str, signal: str, form: str) -> It
         yield form.format(value)
 
 
-def _one(known: ReceivedFrames, message: str, signal: str, form: str) -> Text:
-    value = known.number(message, signal)
-    return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
+def _cell(known: ReceivedFrames, message: str, text: str | None) -> Text:
+    """Grey where the message must not be acted on; None: not known."""
+    return Text("-" if text is None else text, style="" if known.is_valid(message) else "dim")
 
 
-def _percent(known: ReceivedFrames, message: str, signal: str) -> Text:
+def _one(known: ReceivedFrames, message: str, signal: str, form: str, unit: float = 1.0) -> Text:
     value = known.number(message, signal)
-    return Text("-" if value is None else f"{100.0 * value:.0f}", style="" if known.is_valid(message) else "dim")
+    return _cell(known, message, None if value is None else form.format(value / unit))
 
 
 def _pair(known: ReceivedFrames, message: str, signal: str, std: str | None = None) -> Text:
     value, spread = known.number(message, signal), known.number(message, std or f"{signal}Std")
-    figure = "-" if value is None or spread is None else f"{_figures(value, spread)}"
-    return Text(figure, style="" if known.is_valid(message) else "dim")
+    return _cell(known, message, None if value is None or spread is None else _figures(value, spread))
 
 
 def _figures(value: float, spread: float) -> str:

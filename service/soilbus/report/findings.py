@@ -20,7 +20,7 @@ from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.diagnose import Findings
-from soilbus.pipeline.outputs import known
+from soilbus.pipeline.outputs import known, value_std, values_std
 from soilbus.report.next_drive import plan_lines
 from soilbus.report.soil_prior import SHOWN
 from soilbus.report.statement import (
@@ -75,7 +75,7 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],
         "soils": soils,
-        "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "model": {name: values_std(values) for name, values in findings.diagnosis.completed.parameters().items()},
         "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
         "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
         "warning": WARNING if diagnosis.residual_terms else None,
@@ -116,7 +116,7 @@ def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
     effect = addition.effect
     return {
         "name": effect.name,
-        "parameters": _estimates(completed.parameters()[effect.name]),
+        "parameters": values_std(completed.parameters()[effect.name]),
         "probability": addition.probability,
         "alternatives": [{"name": name, "probability": p} for name, p in addition.alternatives.items()],
         "sentence": effect.physics,
@@ -154,13 +154,9 @@ def why_ambiguous(addition: Addition) -> str | None:
 
 def _soil(posterior: Posterior, findings: Findings) -> dict[str, Any]:
     settings = findings.config.estimator
-    bearing = posterior.bearing_pressure(settings.z_ref, settings.b_ref)
-    pressure = {"z_ref": settings.z_ref, "b_ref": settings.b_ref, "value": bearing.value, "std": bearing.std}
-    return {**_estimates(posterior.parameters()), "bearing_pressure": pressure}
-
-
-def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
-    return {name: {"value": e.value, "std": e.std} for name, e in estimates.items()}
+    plate = {"z_ref": settings.z_ref, "b_ref": settings.b_ref}
+    bearing = plate | value_std(posterior.bearing_pressure(settings.z_ref, settings.b_ref))
+    return {**values_std(posterior.parameters()), "bearing_pressure": bearing}
 
 
 def findings_text(findings: Findings) -> str:

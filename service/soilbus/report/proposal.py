@@ -18,6 +18,7 @@ from cantools.database.can import Database, Message
 from soilbus.can.mapping import VEHICLE_ROLES
 from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, dimensions_of, is_word_in, shown
 from soilbus.config.file import OPEN
+from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts, is_absent
 
 __all__ = ["Proposal", "proposal"]
@@ -333,11 +334,7 @@ def _put_rest(draft: _Draft) -> None:
     known = draft.assignment
     found = [*(c for cs in known.open.values() for c in cs), *known.asserted.values(), *known.rivals]
     rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
-    perhaps: dict[str, list[Candidate]] = {}
-    for c in rest.values():
-        if not is_absent(c):
-            perhaps.setdefault(c.slot.role, []).append(c)
-    if perhaps:
+    if perhaps := grouped((c for c in rest.values() if not is_absent(c)), lambda c: c.slot.role):
         draft.lines += ["", "# Not used, but perhaps:"]
         draft.lines += [f"#   {role}: {_listed(cs)}" for role, cs in perhaps.items()]
     unnamed: dict[str, list[Candidate]] = {}

@@ -10,7 +10,8 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
-from soilbus.pipeline.result import WindowResult
+from soilbus.grouping import grouped
+from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.report.advice import advice, of_use
 from soilbus.report.configuration import NO_SLOPE, shows_no_slope
 from soilbus.report.page import Picture, Source, Table, page
@@ -20,11 +21,10 @@ from soilbus.report.replay_pictures import (
     curve_pictures,
     dates,
     decision_picture,
-    is_clock,
     map_pictures,
     run_pictures,
 )
-from soilbus.report.windows import grouped, why_of_no_use
+from soilbus.report.windows import by_reason, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
@@ -113,7 +113,7 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tupl
     """What to do about windows of no or little use, and what to map: a sentence, and a command or nothing."""
     config = source.config
     good = [r for r in results if r.status is Status.VALID]
-    for (status, reason), group in grouped(results):
+    for (status, reason), group in by_reason(results):
         what = advice(group, good)
         if what is not None:
             why = reason.removeprefix(f"{status} ").replace("_", " ")
@@ -132,9 +132,7 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tupl
 
 def _by_log(results: Sequence[WindowResult]) -> Table | None:
     """A row for each of several logs."""
-    logs: dict[str, list[WindowResult]] = {}
-    for r in results:
-        logs.setdefault(r.log or "-", []).append(r)
+    logs = grouped(results, lambda r: r.log or "-")
     if len(logs) < 2:
         return None
     rows = []
@@ -156,7 +154,7 @@ def _windows(results: Sequence[WindowResult]) -> Table:
     rows = [
         (
             r.log or "-",
-            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_clock(r.t) else f"{r.t:.1f}",
+            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_date(r.t) else f"{r.t:.1f}",
             str(r.status) + ("" if r.reason == "none" else f" ({r.reason})"),
             "-" if r.bearing is None else f"{r.bearing.value / 1e3:.2f} ± {r.bearing.std / 1e3:.2f}",
             "-" if r.traversability.max_draft is None else f"{r.traversability.max_draft.value / 1e3:.2f}",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -19,13 +20,11 @@ from soilbus.can.admission import LONGEST_GAP
 from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.posterior import Estimate
-from soilbus.pipeline.result import WindowResult
+from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.report.advice import of_use
 from soilbus.report.page import Picture, picture
 from soilbus.terra.earth import offset
 
-FIRST_CLOCK, LAST_CLOCK = 946684800.0, 4102444800.0
-"""Stamps [s] from 2000 to 2100 are times of day; others count from some start."""
 SPACE_BETWEEN = 0.03
 """Space between two recordings in a picture, as a share of the time of all."""
 TICK_STEPS = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 21600, 43200, 86400)
@@ -73,19 +72,14 @@ def stretches(results: Sequence[WindowResult]) -> list[list[WindowResult]]:
     return cut
 
 
-def is_clock(t: float) -> bool:
-    """Whether a stamp [s] is a time of day, not seconds from some start."""
-    return FIRST_CLOCK <= t < LAST_CLOCK
-
-
 def clock_text(t: float, form: str = "%H:%M:%S") -> str:
     """A stamp [s] as a time of day (UTC), or in seconds where it is none."""
-    return f"{datetime.fromtimestamp(t, UTC):{form}}" if is_clock(t) else f"{t:g} s"
+    return f"{datetime.fromtimestamp(t, UTC):{form}}" if is_date(t) else f"{t:g} s"
 
 
 def dates(results: Sequence[WindowResult]) -> str:
     """The days of the windows, as in "2026-05-04 to 2026-05-05"; empty where their stamps are no times of day."""
-    known = sorted(r.t for r in results if is_clock(r.t))
+    known = sorted(r.t for r in results if is_date(r.t))
     days = dict.fromkeys(clock_text(t, "%Y-%m-%d") for t in (known[0], known[-1])) if known else {}
     return " to ".join(days)
 
@@ -217,9 +211,7 @@ def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[
     plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
     wheels = list(results[0].slip)
 
-    def drawn(label: str, draw: Callable[[Any], None], words: str) -> Picture:
-        return _over_time(time, label, draw, words)
-
+    drawn = partial(_over_time, time)
     if of_use(results):
         yield (
             f"How firm is the ground? Pressure that carries {plate}.",

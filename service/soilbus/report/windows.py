@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from soilbus.decision.traversability import State, Status
+from soilbus.grouping import grouped
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
@@ -58,7 +59,7 @@ def summary_of(
     lines = [f"{len(results)} windows from {heard}"]
     lines.append(f"of use: {len(good)} valid, {estimated} with a doubtful estimate; of no use: {unused(results)}")
     lines += _by_log(results)
-    for (status, reason), group in grouped(results):
+    for (status, reason), group in by_reason(results):
         lines.append(f"  {len(group):5d} {status}" + ("" if reason == "none" else f": {reason}"))
         what = advice(group, good)
         lines += [] if what is None else [f"        {what}"]
@@ -100,26 +101,22 @@ def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
     """
     if not results:
         return f"no window could be made: no recording lasts the {window:g} s of a window"
-    (status, reason), group = grouped(results)[0]
+    (status, reason), group = by_reason(results)[0]
     what = advice(group, [])
     return f"no window could be used: {len(group)} of {len(results)} are {status}: {reason}" + (
         "" if what is None else f" ({what})"
     )
 
 
-def grouped(results: Sequence[WindowResult]) -> list[tuple[tuple[str, str], list[WindowResult]]]:
+def by_reason(results: Sequence[WindowResult]) -> list[tuple[tuple[str, str], list[WindowResult]]]:
     """The windows by status and reason, the most frequent first."""
-    groups: dict[tuple[str, str], list[WindowResult]] = {}
-    for r in results:
-        groups.setdefault((str(r.status), r.reason), []).append(r)
+    groups = grouped(results, lambda r: (str(r.status), r.reason))
     return sorted(groups.items(), key=lambda item: -len(item[1]))
 
 
 def _by_log(results: Sequence[WindowResult]) -> list[str]:
     """A line for each of several logs."""
-    logs: dict[str, list[WindowResult]] = {}
-    for r in results:
-        logs.setdefault(r.log or "", []).append(r)
+    logs = grouped(results, lambda r: r.log or "")
     if len(logs) < 2:
         return []
     return [

@@ -150,6 +150,15 @@ class Bins:
         return made_window(self._noise, self.origin + centre, mean, count * worth, samples)
 
 
+def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Array:
+    """Mean value (n,) of samples (N,) at times t [s] in each of n bins of a length [s]; nan in a bin without any."""
+    place = np.floor((t - start) / length + 1e-6).astype(np.intp)
+    inside = (place >= 0) & (place < n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        count = np.bincount(place[inside], minlength=n)
+        return np.asarray(np.bincount(place[inside], value[inside], minlength=n) / count)
+
+
 def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Array, Array, Array]:
     """Bins between the samples of channels that are slower than the bins, on the line from sample to sample.
 

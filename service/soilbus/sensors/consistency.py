@@ -35,6 +35,7 @@ from soilbus.estimation.window import (
     turning,
     zero_if_unknown,
 )
+from soilbus.sensors.bins import bin_means
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
 
 SUSTAINED = 1.0
@@ -175,12 +176,7 @@ class SensorConsistency:
             if not heard:
                 continue
             t, value = (np.concatenate(parts) for parts in zip(*heard, strict=True))
-            bins = np.floor((t - begin) / self._settings.bin + 1e-6).astype(np.intp)
-            inside = (bins >= 0) & (bins < n)
-            count = np.bincount(bins[inside], minlength=n)
-            total = np.bincount(bins[inside], np.abs(value[inside]), minlength=n)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                speed[:, self._rig.wheels.index(wheel)] = total / count
+            speed[:, self._rig.wheels.index(wheel)] = bin_means(t, np.abs(value), begin, self._settings.bin, n)
         return speed
 
 
@@ -207,8 +203,18 @@ def implausible(
     min_speed [m/s] and max_turn as the estimator's gates; resolution by channel name;
     motor_speed [rad/s] (N, W), nan where unknown, may be named as "motor_speed.FL".
     """
+
+    def seen(raw: Window, motor: Array) -> ConsistencyInput:
+        window = completed(raw, rig)
+        driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
+        ground = np.where(driving, window.ground_speed, np.nan)[:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
+        slip = slip_ratio(rig.radius, window.speed, ground)
+        return ConsistencyInput(window, raw, rig, bin_length, driving, slip, traction, motor, resolution)
+
     motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
-    data = consistency_input(window, rig, min_speed, max_turn, bin_length, resolution, motor)
+    data = seen(window, motor)
     if not data.driving.any():
         return ()
     named: set[str] = set()
@@ -217,7 +223,7 @@ def implausible(
             named |= found
             window = without(window, rig, found)
             motor = np.where([f"motor_speed.{w}" in found for w in rig.wheels], np.nan, motor)
-            data = consistency_input(window, rig, min_speed, max_turn, bin_length, resolution, motor)
+            data = seen(window, motor)
     order = (*rig.channels, *(f"motor_speed.{w}" for w in rig.wheels))
     return tuple(name for name in order if name in named)
 
@@ -245,25 +251,6 @@ def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
         for row in getattr(rig.instrumentation, quantity):
             if row.kind == "channel" and row.weight[place]:
                 yield f"{quantity}.{row.name}"
-
-
-def consistency_input(
-    window: Window,
-    rig: Rig,
-    min_speed: float,
-    max_turn: float,
-    bin_length: float,
-    resolution: Mapping[str, Resolution],
-    motor_speed: Array,
-) -> ConsistencyInput:
-    """What the checks need of a window."""
-    raw, window = window, completed(window, rig)
-    driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
-    ground = np.where(driving, window.ground_speed, np.nan)[:, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
-    slip = slip_ratio(rig.radius, window.speed, ground)
-    return ConsistencyInput(window, raw, rig, bin_length, driving, slip, traction, motor_speed, resolution)
 
 
 def frozen(data: ConsistencyInput) -> Iterator[str]:
@@ -393,7 +380,8 @@ def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
     reported = data.bin * moving_sum(_without_slope(data), lag)
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
     reported_noise = data.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
-    if _opposite(data, gained, noise, LEAST_SPEED, reported, reported_noise, LEAST_SPEED, LEAST_SLOWING):
+    limits = (np.maximum(DEVIATIONS * sd, LEAST_SPEED) for sd in (noise, reported_noise))
+    if _opposite(data, (gained, reported), limits, LEAST_SLOWING):
         yield "acceleration"
 
 
@@ -519,30 +507,20 @@ def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
     pull_noise = np.sqrt(change_variance(of_pull, lag))
-    least = LEAST_FORCE * weight
-    if _opposite(data, driven, noise, least, pull, pull_noise, least, LEAST_PULLING):
+    limits = (np.maximum(DEVIATIONS * sd, LEAST_FORCE * weight) for sd in (noise, pull_noise))
+    if _opposite(data, (driven, pull), limits, LEAST_PULLING):
         yield "draft"
 
 
-def _opposite(
-    data: ConsistencyInput,
-    one: Array,
-    one_noise: Array,
-    one_least: float,
-    other: Array,
-    other_noise: Array,
-    other_least: float,
-    seconds: float,
-) -> bool:
-    """Whether changes (M,) of two quantities that go together go against each other for so long.
+def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], limits: Iterable[Array], seconds: float) -> bool:
+    """Whether changes (M,) of two quantities that should go together are opposite for this time [s].
 
-    Only changes count that are significant, of both: beyond their noise and at least so great.
+    Only instants count at which both changes exceed their limits (M,).
     """
     with np.errstate(invalid="ignore"):
-        both = np.abs(one) > np.maximum(DEVIATIONS * one_noise, one_least)
-        both &= np.abs(other) > np.maximum(DEVIATIONS * other_noise, other_least)
+        both = np.logical_and(*(np.abs(change) > limit for change, limit in zip(changes, limits, strict=True)))
     both &= data.driving[len(data.driving) - len(both) :]
-    a, b = one[both], other[both]
+    a, b = (change[both] for change in changes)
     product, n = a * b, max(round(seconds / data.bin), 1)
     if np.count_nonzero(product < 0.0) < OPPOSITE * n:
         return False

@@ -1,10 +1,12 @@
 """Single outliers: readings that fit neither their noise nor the readings around them.
 
-Each sample is compared with a robust straight line through the four before and the four
-after it (a Hampel identifier with the trend taken out; cf. Davies & Gather, J. Am. Stat.
-Assoc. 88, 1993, 782-792).  Steps, bends and vibration widen the limit, so that only one or
-two samples standing out by themselves are called outliers: longer runs, frozen or offset
-sensors are the model's to notice.
+    outlier    |y - line(t)| > max(6.5 sd, 3 q, 8 sd_v)
+
+The line joins the medians of the four samples before and of the four after (Hampel identifier with the trend taken out;
+cf. Davies & Gather, J. Am. Stat. Assoc. 88, 1993, 782-792).  sd is the sensor's noise, q the distance of the quartiles
+of the nine samples less their trend, sd_v the channel's own scatter where it vibrates.  q and sd_v widen the limit in
+steps, bends and vibration, so that only one or two samples that stand out alone are outliers.  Longer runs, frozen
+sensors and offsets are found by `consistency` or by the fit of the model.
 """
 
 from __future__ import annotations

@@ -34,7 +34,8 @@ from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
-from soilbus.sensors.bins import Bins
+from soilbus.grouping import grouped
+from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
@@ -195,7 +196,7 @@ class Facts(NamedTuple):
         )
 
 
-def survey(config: Config, database: Database, frames: Iterable[Frame], limits: Limits = LIMITS) -> Survey:
+def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Survey:
     """Compare a recording with a configuration.
 
     Parameters
@@ -204,8 +205,6 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
         The configuration and the messages of the vehicle's bus.
     frames
         Of one recording: (time [s], identifier, extended, data, remote, error).
-    limits
-        Thresholds of the checks.
 
     Returns
     -------
@@ -229,12 +228,12 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
         return Survey(seen, (Finding(text, True),), ())
-    findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database, limits))]
-    findings += [*_stuck_and_jagged(seen, longest, config, limits), *_mixed_rates(seen, config, limits)]
+    findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database))]
+    findings += [*_stuck_and_jagged(seen, longest, config), *_mixed_rates(seen, config)]
     facts = _facts(with_motors, mapped, longest, database)
-    open_questions = [f"{_key(s.channel)}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
+    open_questions = [f"{s.channel.key}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
     if facts is not None:
-        found, questions = _compared(facts, findings, channels, database, limits)
+        found, questions = _compared(facts, findings, channels, database)
         findings += found
         open_questions += questions
     return Survey(seen, tuple(findings), tuple(open_questions))
@@ -298,31 +297,18 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns, database: Data
     motor = np.full(raw.speed.shape, np.nan)
     for i, wheel in enumerate(rig.wheels):
         if f"motor_speed.{wheel}" in heard:
-            motor[:, i] = _binned(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
+            motor[:, i] = bin_means(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
     of_axles: dict[str, tuple[Array, Array]] = {
         a.name: heard[f"speed.{a.name}"] for a in config.axle if f"speed.{a.name}" in heard
     }
-    shaft = {name: _binned(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
+    shaft = {name: bin_means(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
     moving = np.abs(window.ground_speed) > config.estimator.min_speed
     straight = moving & ~turning(window, rig, config.estimator.max_turn)
     by_radius = frozenset(w.name for w in config.wheel if w.speed is not None and _is_in_metres(w.speed, database))
     return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped), by_radius)
 
 
-def _binned(t: Array, value: Array, start: float, bin_length: float, n: int) -> Array:
-    place = np.floor((t - start) / bin_length + 1e-9).astype(np.intp)
-    inside = (place >= 0) & (place < n)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        count = np.bincount(place[inside], minlength=n)
-        return np.asarray(np.bincount(place[inside], value[inside], minlength=n) / count)
-
-
 # --- one signal by itself ---
-
-
-def _key(channel: Channel) -> str:
-    """The key of the configuration that maps this channel."""
-    return channel.key
 
 
 def _is_absent(seen: Seen) -> bool:
@@ -351,37 +337,34 @@ _REFUSAL: Mapping[Reason, str] = {
 
 def _absent(seen: Iterable[Seen], database: Database) -> Iterator[Finding]:
     """Messages without which nothing can be estimated, and that never came."""
-    missing: dict[str, list[Channel]] = {}
-    for s in seen:
-        if _is_absent(s) and not _is_optional(s):
-            missing.setdefault(s.channel.message, []).append(s.channel)
-    for name, channels in missing.items():
+    missing = [s.channel for s in seen if _is_absent(s) and not _is_optional(s)]
+    for name, channels in grouped(missing, lambda channel: channel.message).items():
         message = database.get_message_by_name(name)
         where = f"{'29' if message.is_extended_frame else '11'}-bit identifier {message.frame_id:#x}"
-        keys = ", ".join(_key(channel) for channel in channels)
+        keys = ", ".join(channel.key for channel in channels)
         yield Finding(f"{keys}: no frame of {name} ({where}) was heard", True, tuple(c.name for c in channels))
 
 
-def _of_one(seen: Seen, database: Database, limits: Limits) -> Iterator[Finding]:
+def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
     """Whether a signal comes often enough and its values are accepted."""
-    channel, key = seen.channel, _key(seen.channel)
+    channel, key = seen.channel, seen.channel.key
     message = database.get_message_by_name(channel.message)
     refused = sum(seen.refused.values())
     if _is_absent(seen):
         return
     share = refused / (refused + seen.count)
-    if share > limits.refused:
+    if share > LIMITS.refused:
         reason, n = max(seen.refused.items(), key=lambda item: item[1])
         unit = SI.get(_dimension(channel), "")
         why = _REFUSAL.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
         text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
-        yield Finding(text, share > 4.0 * limits.refused, (channel.name,) if share > 4.0 * limits.refused else ())
+        yield Finding(text, share > 4.0 * LIMITS.refused, (channel.name,) if share > 4.0 * LIMITS.refused else ())
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
         due = 1e3 / message.cycle_time * (1.0 - share) if message.cycle_time else 0.0
-        if seen.rate < limits.rate * due:
+        if seen.rate < LIMITS.rate * due:
             yield Finding(f"{key}: {seen.rate:.3g} values a second, where the DBC says {due:.3g}", False)
-        elif seen.rate < limits.least_rate and not _is_optional(seen):
-            yield Finding(f"{key}: only {seen.rate:.3g} values a second; windows need {limits.least_rate:g}", False)
+        elif seen.rate < LIMITS.least_rate and not _is_optional(seen):
+            yield Finding(f"{key}: only {seen.rate:.3g} values a second; windows need {LIMITS.least_rate:g}", False)
 
 
 def _dimension(channel: Channel) -> str:
@@ -393,7 +376,7 @@ def _dimension(channel: Channel) -> str:
     return of_quantity.get(channel.quantity, "angle")
 
 
-def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limits: Limits) -> Iterator[Finding]:
+def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> Iterator[Finding]:
     """Values that never change while the vehicle drives, and values that jump more than a vehicle can."""
     ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
     moving = ground[0][np.abs(ground[1]) > config.estimator.min_speed]
@@ -405,8 +388,8 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limi
         _, value = heard[name]
         unit = SI.get(_dimension(s.channel), "")
         if s.low == s.high:
-            if drives > limits.least_seconds or quantity == "ground_speed":
-                text = f"{_key(s.channel)}: reads {s.low:.4g} {unit} in all {s.count} values: is the sensor connected?"
+            if drives > LIMITS.least_seconds or quantity == "ground_speed":
+                text = f"{s.channel.key}: reads {s.low:.4g} {unit} in all {s.count} values: is the sensor connected?"
                 yield Finding(text, False, (name,) if s.low != 0.0 else ())
             continue
         noise = getattr(config.noise, "speed" if quantity == "motor_speed" else quantity)
@@ -415,9 +398,9 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limi
         jumps = np.abs(np.diff(value))
         typical = float(np.median(jumps))
         alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
-        if typical > max(limits.jump_sd * sd, limits.jump * size) and alike > 0.5:
+        if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
             yield Finding(
-                f"{_key(s.channel)}: jumps by {typical:.3g} {unit} from one value to the next, {typical / sd:.0f} times"
+                f"{s.channel.key}: jumps by {typical:.3g} {unit} from one value to the next, {typical / sd:.0f} times"
                 f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.message}."
                 f"{s.channel.signal} right in the DBC?",
                 True,
@@ -425,16 +408,16 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limi
             )
 
 
-def _mixed_rates(seen: Iterable[Seen], config: Config, limits: Limits) -> Iterator[Finding]:
+def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
     """Bins that hold one sample of a wheel's channel and several of another: a mean beside a value of one instant."""
     wheels = [s for s in seen if s.channel.quantity in ("torque", "speed", "load") and s.rate > 0.0]
     if len(wheels) < 2:
         return
     slow, fast = (by(wheels, key=lambda s: s.rate) for by in (min, max))
     present, length = config.estimator.bin, min(max(1.0 / fast.rate, SHORT_BIN), 0.5 / slow.rate)
-    if slow.rate * present < limits.instant and fast.rate * present >= limits.mean_of and length < present:
+    if slow.rate * present < LIMITS.instant and fast.rate * present >= LIMITS.mean_of and length < present:
         yield Finding(
-            f"{_key(slow.channel)}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {_key(fast.channel)}: in"
+            f"{slow.channel.key}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {fast.channel.key}: in"
             f" bins of {present:g} s a mean stands beside a value of one instant, and loads that shake bias the soil;"
             f" set estimator.bin = {length:.2g}",
             False,
@@ -443,17 +426,17 @@ def _mixed_rates(seen: Iterable[Seen], config: Config, limits: Limits) -> Iterat
 
 # --- signals compared with each other ---
 
-Check = Callable[[Facts, Limits], Iterator[Finding]]
+Check = Callable[[Facts], Iterator[Finding]]
 
 
 def _compared(
-    facts: Facts, before: Iterable[Finding], channels: Iterable[Channel], database: Database, limits: Limits
+    facts: Facts, before: Iterable[Finding], channels: Iterable[Channel], database: Database
 ) -> tuple[list[Finding], list[str]]:
     """Findings of all checks, each without the channels that an earlier check has named, and open questions."""
     facts = facts.less(name for f in before for name in f.channels)
-    if facts.straight.sum() * facts.config.estimator.bin < limits.least_seconds:
+    if facts.straight.sum() * facts.config.estimator.bin < LIMITS.least_seconds:
         return [], [
-            f"the vehicle drives straight on for less than {limits.least_seconds:g} s: signs, gear ratio and sides"
+            f"the vehicle drives straight on for less than {LIMITS.least_seconds:g} s: signs, gear ratio and sides"
             " cannot be compared"
         ]
     findings: list[Finding] = []
@@ -464,7 +447,7 @@ def _compared(
     )  # fmt: skip
     for check in checks:
         try:
-            found = list(check(facts, limits))
+            found = list(check(facts))
         except UndecidableError as reason:
             if not any(f.fatal for f in (*before, *findings)):  # else undecided because of the fault
                 questions.append(str(reason))
@@ -472,11 +455,11 @@ def _compared(
         findings += found
         facts = facts.less(name for f in found for name in f.channels)
     if not any(f.fatal for f in (*before, *findings)):
-        findings += _contradictions(facts, channels, database, limits)
+        findings += _contradictions(facts, channels, database)
     return findings, questions
 
 
-def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _weight(facts: Facts) -> Iterator[Finding]:
     """Sum of the loads against the mass, and each axle's load against the geometry."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
@@ -490,12 +473,12 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
         raise UndecidableError("not every wheel load is known: the loads cannot be compared with the mass")
     weight = chassis.mass * GRAVITY
     off = measured / weight - 1.0
-    if abs(off) > limits.weight / 2.0:
+    if abs(off) > LIMITS.weight / 2.0:
         yield Finding(
             f"the wheel loads sum to {measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg, but"
             f" vehicle.mass = {chassis.mass:g} kg: {_why_weight(measured / weight)}",
-            abs(off) > limits.weight,
-            names if abs(off) > limits.weight else (),
+            abs(off) > LIMITS.weight,
+            names if abs(off) > LIMITS.weight else (),
         )
         return
     if set(rig.front.tolist()) != {True, False}:
@@ -503,7 +486,7 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
     draft, acceleration = (np.where(np.isfinite(a), a, 0.0) for a in (window.draft, window.acceleration))
     due = [median(np.broadcast_to(a, window.t.shape)) for a in axle_loads(chassis, draft, pitch, acceleration)]
     has = [median(window.load[:, rig.front].sum(axis=1)), median(window.load[:, ~rig.front].sum(axis=1))]
-    if max(has) > (1.0 + limits.weight) * weight:
+    if max(has) > (1.0 + LIMITS.weight) * weight:
         axle = "front" if has[0] > has[1] else "rear"
         yield Finding(
             f"the {axle} axle alone carries {max(has) / 1e3:.1f} kN, more than the weight of vehicle.mass ="
@@ -512,8 +495,8 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
             names,
         )
         return
-    if abs(has[0] - due[0]) > limits.axle * weight:
-        swapped = abs(has[0] - due[1]) < limits.axle * weight
+    if abs(has[0] - due[0]) > LIMITS.axle * weight:
+        swapped = abs(has[0] - due[1]) < LIMITS.axle * weight
         yield Finding(
             f"the front wheels carry {has[0] / 1e3:.1f} kN and the rear wheels {has[1] / 1e3:.1f} kN, where mass,"
             f" centre of gravity and draft give {due[0] / 1e3:.1f} and {due[1] / 1e3:.1f} kN: "
@@ -527,7 +510,7 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
         )
 
 
-def _transfer(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _transfer(facts: Facts) -> Iterator[Finding]:
     """Changes of each axle's load against those that draft, slope and inertia bring to it."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     cells = [f"load.{wheel}" for wheel in rig.wheels]
@@ -543,7 +526,7 @@ def _transfer(facts: Facts, limits: Limits) -> Iterator[Finding]:
         return
     y, x = _blocks(rows, block).T
     (share,), (sd,) = _regression(y, x[:, None])
-    if share < limits.transfer - limits.side_sd * sd:
+    if share < LIMITS.transfer - LIMITS.side_sd * sd:
         yield Finding(
             f"load moves between front and rear wheels {share:.2f} times as much as draft, slope and inertia move it:"
             " are loads of front and rear wheels swapped, or is hitch_height or cg_height wrong?",
@@ -568,7 +551,7 @@ def _why_weight(ratio: float) -> str:
     return "which of them is wrong? (ballast, unit or scale of the loads)"
 
 
-def _directions(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _directions(facts: Facts) -> Iterator[Finding]:
     """Wheels that turn or drive in the opposite direction to most."""
     rig, raw = facts.rig, facts.raw
     moving = facts.straight
@@ -597,15 +580,15 @@ def _directions(facts: Facts, limits: Limits) -> Iterator[Finding]:
         yield Finding(text, True, ("ground_speed",))
 
 
-def _gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _gears(facts: Facts) -> Iterator[Finding]:
     """Motor speeds against wheel speeds; an unmapped motor speed may also be the wheel's own."""
     for i, wheel in enumerate(facts.rig.wheels):
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
         own = next(w for w in facts.config.wheel if w.name == wheel)
-        if not math.isfinite(ratio) or abs(math.log(max(ratio, 1e-9))) < limits.gear or own.motor_speed is None:
+        if not math.isfinite(ratio) or abs(math.log(max(ratio, 1e-9))) < LIMITS.gear or own.motor_speed is None:
             continue
-        if f"motor_speed.{wheel}" not in facts.mapped and abs(own.gear_ratio * ratio - 1.0) < limits.gear:
+        if f"motor_speed.{wheel}" not in facts.mapped and abs(own.gear_ratio * ratio - 1.0) < LIMITS.gear:
             continue
         yield Finding(
             f"wheel.{wheel}.gear_ratio = {own.gear_ratio:g}, but {own.motor_speed.signal} turns"
@@ -620,7 +603,7 @@ def _why_gear(facts: Facts, wheels: Iterable[str]) -> str:
     return f"gear ratio,{radius} or unit or byte order of one of the speeds?"
 
 
-def _axle_gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _axle_gears(facts: Facts) -> Iterator[Finding]:
     """The speed of an axle's motor against the mean of its wheels, which any differential keeps."""
     for axle in facts.config.axle:
         names = [w.name for w in facts.config.wheel if w.axle == axle.name and w.speed is not None]
@@ -633,7 +616,7 @@ def _axle_gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
         if ratio < 0.0:
             text = f"axle.{axle.name}.motor_speed: turns backward while its wheels turn forward: sign = -1?"
             yield Finding(text, True, channels)
-        elif math.isfinite(ratio) and abs(math.log(ratio)) > limits.gear:
+        elif math.isfinite(ratio) and abs(math.log(ratio)) > LIMITS.gear:
             yield Finding(
                 f"axle.{axle.name}.gear_ratio = {axle.gear_ratio:g}, but {axle.motor_speed.signal} turns"
                 f" {axle.gear_ratio * ratio:.4g} times as fast as the mean of its wheels: {_why_gear(facts, names)}",
@@ -642,7 +625,7 @@ def _axle_gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
             )
 
 
-def _locked(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _locked(facts: Facts) -> Iterator[Finding]:
     """Speeds left and right behind a locked differential."""
     for axle in facts.config.axle:
         own = [w for w in facts.config.wheel if w.axle == axle.name and w.driven and w.speed is not None]
@@ -651,7 +634,7 @@ def _locked(facts: Facts, limits: Limits) -> Iterator[Finding]:
         one, other = (facts.raw.speed[:, facts.rig.wheels.index(w.name)] for w in own)
         with np.errstate(invalid="ignore", divide="ignore"):
             apart = median(np.abs(one / other - 1.0)[facts.straight])
-        if apart > limits.locked:
+        if apart > LIMITS.locked:
             yield Finding(
                 f'axle.{axle.name}.differential = "locked", but the speeds of {own[0].name} and {own[1].name} differ by'
                 f' {apart:.1%} straight on: "open" or "limited"?',
@@ -660,11 +643,11 @@ def _locked(facts: Facts, limits: Limits) -> Iterator[Finding]:
             )
 
 
-def _free_wheels(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _free_wheels(facts: Facts) -> Iterator[Finding]:
     """Rims of wheels that roll freely against the ground."""
     for i, wheel in enumerate(facts.rig.wheels):
         slip = median(facts.slip[:, i])
-        if not next(w for w in facts.config.wheel if w.name == wheel).driven and abs(slip) > limits.free:
+        if not next(w for w in facts.config.wheel if w.name == wheel).driven and abs(slip) > LIMITS.free:
             yield Finding(
                 f"wheel.{wheel}: rolls freely, but its rim goes {1.0 / (1.0 - slip):.2f} times as fast as the ground:"
                 " radius, or unit of its speed or of the ground speed?",
@@ -673,7 +656,7 @@ def _free_wheels(facts: Facts, limits: Limits) -> Iterator[Finding]:
             )
 
 
-def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _slips(facts: Facts) -> Iterator[Finding]:
     """Rim speeds against the ground speed and against each other."""
     slip, rig = facts.slip, facts.rig
     drives = np.where(facts.thrust > 0.0, slip, np.nan)
@@ -685,12 +668,12 @@ def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
     at_shaft = any(w.speed is not None and w.speed.at == "shaft" for w in facts.config.wheel)
     at_shaft = at_shaft or any(a.motor_speed is not None for a in facts.config.axle)
     gear = "gear ratio, " if at_shaft else ""
-    if middle < limits.pushed or least > limits.never_less:
-        seems = middle if middle < limits.pushed else least
+    if middle < LIMITS.pushed or least > LIMITS.never_less:
+        seems = middle if middle < LIMITS.pushed else least
         factor = 1.0 / (1.0 - seems)
         text = (
             f"the wheels seem to slip by {middle:.2f}, never by less than {least:.2f}"
-            if least > limits.never_less
+            if least > LIMITS.never_less
             else f"driving wheels seem to slip by {middle:.2f}"
         )
         yield Finding(
@@ -701,7 +684,7 @@ def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
         )
         return
     apart = {wheel: own - middle for wheel, own in zip(rig.wheels, usual.tolist(), strict=True)}
-    apart = {wheel: by for wheel, by in apart.items() if abs(by) > limits.wheel_apart}
+    apart = {wheel: by for wheel, by in apart.items() if abs(by) > LIMITS.wheel_apart}
     if 2 * len(apart) > np.isfinite(usual).sum():  # there are no most wheels
         more, less = ([w for w, by in apart.items() if (by > 0.0) is is_more] for is_more in (True, False))
         slips = [f"{' and '.join(w)} by {middle + np.mean([apart[i] for i in w]):.2f}" for w in (more, less) if w]
@@ -734,7 +717,7 @@ def _why_fast(factor: float) -> str:
     return ""
 
 
-def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _balance(facts: Facts) -> Iterator[Finding]:
     """Changes of the wheels' thrust against changes of draft and of slope and inertia."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
@@ -749,7 +732,7 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
             torques,
         )
         return
-    if median(thrust) > limits.most_thrust * weight:
+    if median(thrust) > LIMITS.most_thrust * weight:
         yield Finding(
             f"the wheels thrust with {median(thrust) / 1e3:.0f} kN, more than soil can hold under"
             f" {weight / 1e3:.0f} kN: gear_ratio too large, torques measured at the other side of the gear"
@@ -763,17 +746,17 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
     inertia = pull_given(window, chassis) - window.draft
     changes = np.stack([change(a, lag) for a in (thrust, window.draft, inertia)], axis=1)
     changes = changes[np.isfinite(changes).all(axis=1)]
-    if len(changes) * bin_length < limits.least_seconds:
+    if len(changes) * bin_length < LIMITS.least_seconds:
         raise UndecidableError(
             "torques and draft are not known together: their signs and the gear ratio cannot be compared"
         )
     given, *asked = _blocks(changes, block).T
-    if asked[0].std() < limits.excited * weight:
+    if asked[0].std() < LIMITS.excited * weight:
         raise UndecidableError(
             "the draft hardly changes: the signs of draft and torque and the gear ratio cannot be decided"
         )
     (of_draft, of_inertia), (draft_sd, inertia_sd) = _regression(given, np.stack(asked, axis=1))
-    if of_draft < -limits.side_sd * draft_sd:
+    if of_draft < -LIMITS.side_sd * draft_sd:
         yield Finding(
             "signals.draft: falls whenever the wheels thrust more: sign of the draft (positive holds the vehicle back;"
             " sign = -1)?",
@@ -781,8 +764,8 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
             ("draft",),
         )
         return
-    if of_draft > limits.scale[1] or of_draft + limits.side_sd * draft_sd < limits.scale[0]:
-        of_torque = of_inertia > 2.0 * limits.side_sd * inertia_sd and 0.7 < of_draft / of_inertia < 1.4
+    if of_draft > LIMITS.scale[1] or of_draft + LIMITS.side_sd * draft_sd < LIMITS.scale[0]:
+        of_torque = of_inertia > 2.0 * LIMITS.side_sd * inertia_sd and 0.7 < of_draft / of_inertia < 1.4
         size = "large" if of_draft > 1.0 else "small"
         why = (
             f"gear_ratio too {size}, torques measured at the other side of the gear (`at`), or their unit?"
@@ -795,7 +778,7 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
             (*torques, "draft"),
         )
         return
-    if of_inertia < -limits.side_sd * inertia_sd:
+    if of_inertia < -LIMITS.side_sd * inertia_sd:
         slope = _sd(change(window.pitch, lag)) * GRAVITY
         name = "pitch" if slope > _sd(change(window.acceleration, lag)) else "acceleration"
         positive = "nose up" if name == "pitch" else "where the vehicle speeds up"
@@ -807,7 +790,7 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
         )
 
 
-def _slope(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _slope(facts: Facts) -> Iterator[Finding]:
     """Changes of the wheels' thrust against those of the slope alone."""
     window, chassis = facts.window, facts.rig.chassis
     if chassis is None or "pitch" not in facts.mapped or not np.isfinite(window.pitch).any():
@@ -817,15 +800,15 @@ def _slope(facts: Facts, limits: Limits) -> Iterator[Finding]:
     rest = pull_given(window, chassis) - uphill
     rows = np.stack([change(a, lag) for a in (thrust, uphill, rest)], axis=1)
     rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 40 * block or (x := _blocks(rows, block))[:, 1].std() < limits.excited * weight:
+    if len(rows) < 40 * block or (x := _blocks(rows, block))[:, 1].std() < LIMITS.excited * weight:
         raise UndecidableError("the slope hardly changes: the sign of signals.pitch cannot be decided")
     (of_slope, _), (sd, _) = _regression(x[:, 0], x[:, 1:])
-    if of_slope < -limits.side_sd * sd:
+    if of_slope < -LIMITS.side_sd * sd:
         text = "signals.pitch: the wheels thrust less uphill: its sign (positive nose up; sign = -1)?"
         yield Finding(text, True, ("pitch",))
 
 
-def _levels(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _levels(facts: Facts) -> Iterator[Finding]:
     """Mean thrust against mean pull: the thrust must exceed the pull by the rolling resistance."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
@@ -834,7 +817,7 @@ def _levels(facts: Facts, limits: Limits) -> Iterator[Finding]:
     thrust = median(facts.thrust.sum(axis=1))
     known = facts.straight & np.isfinite(window.pitch)
     asked = median(pull_given(window, chassis)[known])
-    if asked > limits.pull * weight and thrust < limits.less_thrust * asked:
+    if asked > LIMITS.pull * weight and thrust < LIMITS.less_thrust * asked:
         yield Finding(
             f"the wheels thrust with {thrust / 1e3:.2f} kN, but draft, slope and inertia alone ask for"
             f" {asked / 1e3:.2f} kN: gear_ratio too small, torques measured at the other side of the gear (`at`), or"
@@ -852,7 +835,7 @@ def _regression(y: Array, x: Array) -> tuple[Array, Array]:
     return factors, np.sqrt(residual_variance * np.diag(inverse))
 
 
-def _sides(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _sides(facts: Facts) -> Iterator[Finding]:
     """Left and right wheel of each axle: the one with more load, or more slip, must have more torque."""
     rig, thrust, slip = facts.rig, facts.thrust, facts.slip
     for left, right in pairs(rig).T.tolist():
@@ -866,7 +849,7 @@ def _sides(facts: Facts, limits: Limits) -> Iterator[Finding]:
             continue
         y, x = _blocks(y[known][:, None], per_block)[:, 0], _blocks(x[known], per_block)
         factors, sd = _regression(y, np.column_stack([x, np.ones(len(x))]))
-        of_load, of_slip = (factors < -limits.side_sd * sd)[:2]
+        of_load, of_slip = (factors < -LIMITS.side_sd * sd)[:2]
         swapped = f"{names[0]} and {names[1]} are swapped: the wheel with more"
         wheels = tuple(f"{q}.{w}" for q in ("load", "speed", "torque") for w in names)
         if of_load and of_slip:
@@ -876,7 +859,7 @@ def _sides(facts: Facts, limits: Limits) -> Iterator[Finding]:
         elif of_slip:
             yield Finding(f"the speeds of {swapped} slip has less torque", True, wheels)
         mean = median(np.abs(thrust[:, [left, right]]).mean(axis=1))
-        if abs(factors[2]) > limits.side_offset * mean:
+        if abs(factors[2]) > LIMITS.side_offset * mean:
             yield Finding(
                 f"the torques of {names[0]} and {names[1]} differ by {abs(factors[2]) / mean:.0%} of their mean all"
                 " along: gear ratio, sign or scale of one of them?",
@@ -902,7 +885,7 @@ def _blocks(values: Array, n: int) -> Array:
     return np.asarray(values[:whole].reshape(-1, n, values.shape[1]).mean(axis=1))
 
 
-def _yaw(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _yaw(facts: Facts) -> Iterator[Finding]:
     """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster."""
     window, rig = facts.window, facts.rig
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
@@ -922,7 +905,7 @@ def _yaw(facts: Facts, limits: Limits) -> Iterator[Finding]:
         )
 
 
-def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database, limits: Limits) -> Iterator[Finding]:
+def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database) -> Iterator[Finding]:
     """Sensors that contradict the others in many windows, by the checks of `consistency`."""
     s, rig = facts.config.estimator, facts.rig
     resolution = {c.name: resolution_of(c, database) for c in channels}
@@ -935,7 +918,7 @@ def _contradictions(facts: Facts, channels: Iterable[Channel], database: Databas
         motor = np.where(mapped, np.abs(facts.motor[rows]), np.nan)
         named.update(implausible(facts.window.rows(rows), rig, s.min_speed, s.max_turn, s.bin, resolution, motor))
     for name, count in named.items():
-        if count > max(limits.windows * len(begins), 1.0):
+        if count > max(LIMITS.windows * len(begins), 1.0):
             quantity, _, wheel = name.partition(".")
             key = f"wheel.{wheel}.{quantity}" if wheel else f"signals.{quantity}"
             yield Finding(f"{key}: contradicts the other sensors in {count} of {len(begins)} windows", False, (name,))

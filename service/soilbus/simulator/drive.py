@@ -338,7 +338,7 @@ def _as_drive(
 
 def _climbs(config: Config, scenario: Scenario) -> bool:
     """Whether slopes take the pull that the prescribed slip gives, as nothing is towed that could."""
-    if config.vehicle is None or config.vehicle.towing != "never":
+    if not config.tows_nothing:
         return False
     if scenario.draft is not None:
         raise SimulationError("vehicle.towing = never, but the scenario has a draft: give it slopes, speeds or a slip")

@@ -223,7 +223,8 @@ def solve(situation: Situation, mechanics: Mechanics, near: Equilibrium | None =
 
 def _from_near(situation: Situation, mechanics: Mechanics, guess: _Guess) -> Equilibrium:
     """The equilibrium from a guess, and from scratch where that does not lead to one."""
-    result = _newton(situation, mechanics.drivetrain, guess, _forces_of(mechanics))
+    forces = _exact(mechanics.model) if mechanics.plain else _by_differences(mechanics)
+    result = _newton(situation, mechanics.drivetrain, guess, forces)
     lost = np.flatnonzero(~result.found)
     if len(lost):
         again = _from_scratch(_at(situation, lost), mechanics)
@@ -308,10 +309,6 @@ def _from_scratch(situation: Situation, mechanics: Mechanics) -> Equilibrium:
         return plain
     guess = _Guess(plain.slip, plain.draft, plain.lead, plain.entry_angle)
     return _newton(situation, drivetrain, guess, _by_differences(mechanics))
-
-
-def _forces_of(mechanics: Mechanics) -> _Forces:
-    return _exact(mechanics.model) if mechanics.plain else _by_differences(mechanics)
 
 
 def _exact(model: WheelModel) -> _Forces:

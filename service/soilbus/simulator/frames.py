@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import can
@@ -25,6 +25,7 @@ from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.can.publish import checksum_byte, value_codes
 from soilbus.config.model import Config
+from soilbus.grouping import grouped
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng, true_speed
 
@@ -88,7 +89,7 @@ class Encoder:
         self._config, self._start = config, start
         self._messages = [
             (database.get_message_by_name(name), channels, channel_rng(seed, name))
-            for name, channels in _by_message(channels_of(config, database)).items()
+            for name, channels in grouped(channels_of(config, database), lambda channel: channel.message).items()
         ]
         self._sent: Counter[str] = Counter()
         self._last: dict[str, Column] = {}
@@ -157,13 +158,6 @@ def _bit_columns(signal: Signal) -> NDArray[np.intp]:
         return last - np.arange(signal.length)
     position = signal.start + np.arange(signal.length)
     return np.asarray(8 * (position // 8) + 7 - position % 8)
-
-
-def _by_message(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
-    groups: dict[str, list[Channel]] = {}
-    for channel in channels:
-        groups.setdefault(channel.message, []).append(channel)
-    return groups
 
 
 def _sampled(columns: Mapping[str, Column], channels: list[Channel], t: Array) -> dict[str, Array]:

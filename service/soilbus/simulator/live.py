@@ -15,8 +15,8 @@ import can
 from soilbus.can.bus import bus_fault, open_bus
 from soilbus.config.model import Config
 from soilbus.simulator.commands import Commands
-from soilbus.simulator.drive import STEP, Command, Drive, steps
-from soilbus.simulator.frames import START_TIME, Encoder
+from soilbus.simulator.drive import Command, Drive, steps
+from soilbus.simulator.frames import Encoder
 from soilbus.simulator.play import send_in_time
 from soilbus.simulator.scenario import Scenario
 from soilbus.simulator.sensors import Instruments
@@ -29,12 +29,7 @@ Step = tuple[Drive, list[can.Message]]
 
 
 def driven_frames(
-    config: Config,
-    scenario: Scenario,
-    seed: int,
-    commanded: Callable[[float], Command],
-    step: float = STEP,
-    start: float = START_TIME,
+    config: Config, scenario: Scenario, seed: int, commanded: Callable[[float], Command]
 ) -> Iterator[Step]:
     """A drive with its frames, a step after the other.
 
@@ -44,18 +39,14 @@ def driven_frames(
         As of `simulate`.
     commanded
         Asked at the beginning of each step, with the time since the start [s].
-    step
-        Length of a step [s].
-    start
-        Stamp of the first instant [s].
 
     Raises
     ------
     SimulationError, KeyError, ConfigError
         As `drive.drive`.
     """
-    instruments, encoder = Instruments(config, seed, scenario.vehicle_seed), Encoder(config, seed, start=start)
-    for done in steps(config, scenario, seed, (), step, commanded):
+    instruments, encoder = Instruments(config, seed, scenario.vehicle_seed), Encoder(config, seed)
+    for done in steps(config, scenario, seed, commanded=commanded):
         frames: list[can.Message] = []
         if len(done.columns["t"]):
             frames = list(encoder.frames(instruments.measure(done), done.columns))

@@ -69,13 +69,7 @@ def scenario_over(
     )
 
 
-def send_in_time(
-    messages: Iterable[can.Message],
-    send: Callable[[can.Message], None],
-    speed: float = 1.0,
-    clock: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
-) -> None:
+def send_in_time(messages: Iterable[can.Message], send: Callable[[can.Message], None], speed: float = 1.0) -> None:
     """Send messages spaced as their stamps are.
 
     Parameters
@@ -86,15 +80,13 @@ def send_in_time(
         Sends one.
     speed
         Seconds of the recording per second.
-    clock, sleep
-        Monotonic time [s] and waiting by it.
     """
     first: float | None = None
-    begin = clock()
+    begin = time.monotonic()
     for message in messages:
         if first is None:
             first = message.timestamp
-        ahead = (message.timestamp - first) / speed - (clock() - begin)
+        ahead = (message.timestamp - first) / speed - (time.monotonic() - begin)
         if ahead > 0.0005:
-            sleep(ahead)
+            time.sleep(ahead)
         send(message)

@@ -31,14 +31,13 @@ from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
 from soilbus.validation.boggings import KINDS, BoggingDrive, bogging
 from soilbus.validation.firm_drives import DRIVE_TIME, EASY, FIRM_KINDS, HARD, firm_ground
 from soilbus.validation.monte_carlo import Each
-from soilbus.validation.windows import task_of, torque_limits
+from soilbus.validation.windows import bins_of, task_of, torque_limits
 
 HALVES = ("report", "tune")
 """Drives by the parity of their seeds: even ones are reported, odd ones serve to set thresholds."""
@@ -239,8 +238,7 @@ def _looks_and_curves(
     """What is seen until the end [s], and from their times on the curves of windows."""
     rig, settings = rig_of(config), config.estimator
     estimator, limit = WindowEstimator(config), torque_limits(config, rig)
-    store = Bins(rig, settings.bin, 0.0)
-    store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
+    store = bins_of(config, recording.channels)
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():
         window = completed(forward(store.window(due - settings.window, due)), rig)

@@ -17,15 +17,14 @@ from soilbus.decision.capability import Demand, slip_grid
 from soilbus.decision.wheels import wheel_table
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.laplace import cold_fit
-from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS
 from soilbus.validation.random_soils import CONFIG, MAX_SLIP, MODEL, RIG, Compared, assessed, by_draws, compared
+from soilbus.validation.windows import observed
 
 DRIVES = {"wide": Swing(0.05, 0.40), "narrow": Swing(0.08, 0.15)}
 PRIORS = {"usual": (), "rough c and K": ("soil.c={value=5000.0,std=5000.0}", "soil.K={value=0.02,std=0.02}")}
@@ -48,10 +47,8 @@ def posterior_of(case: Case, seed: int) -> Posterior | None:
         recording = simulate(config, Scenario(10.0, (Patch(0.0, case.soil),), slip=DRIVES[case.drive]), seed)
     except SimulationError:
         return None
-    store = Bins(RIG, 0.1, 0.0)
-    channels = [n for n in RIG.channels if n in recording.channels and (case.sinkage or not n.startswith("sinkage"))]
-    store.add({n: (recording.channels[n].t, recording.channels[n].value) for n in channels})
-    fit = cold_fit(ObservationModel(store.window(0.0, 10.0), RIG, MODEL, CONFIG.estimator.min_speed), prior_of(config))
+    channels = {n: c for n, c in recording.channels.items() if case.sinkage or not n.startswith("sinkage")}
+    fit = cold_fit(observed(CONFIG, channels, 10.0), prior_of(config))
     return None if fit is None or not fit.converged else fit.reported.posterior
 
 

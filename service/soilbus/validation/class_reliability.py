@@ -14,19 +14,19 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SearchOptions
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
 from soilbus.estimation.tracker import TrackerOptions
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import UNKNOWN
 from soilbus.terra.wheel import Soil
+from soilbus.validation.windows import observed
 
 __all__ = [
     "WIDE_COHESION",
@@ -86,10 +86,7 @@ def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: fl
         return None
     if recording.bogged_at is not None:
         return None
-    rig, channels = rig_of(config), recording.channels
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({name: (channels[name].t, channels[name].value) for name in rig.channels if name in channels})
-    return ObservationModel(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
+    return observed(config, recording.channels, seconds)
 
 
 def shortfall(predictions: list[Prediction]) -> float:

@@ -23,13 +23,13 @@ from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95, SoilPrior
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import soil_named
 from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE, prior_about, processes
+from soilbus.validation.windows import bins_of
 
 CELLS = ("cells", "axle cells", "none")
 """Load cells of the wheels, of the axles, of neither."""
@@ -72,13 +72,11 @@ def window_of(task: Task) -> tuple[ObservationModel, SoilPrior] | None:
     soils = (Patch(0.0, task.soil),)
     scenario = Scenario(settings.window, soils, slip=SLIP_RANGE, bounce=task.bounce, drawn_mass=True)
     try:
-        recording, rig = simulate(config, scenario, task.seed), rig_of(config)
+        channels = simulate(config, scenario, task.seed).channels
     except SimulationError:
         return None
-    store = Bins(rig, settings.bin, 0.0)
-    store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    window = store.window(0.0, settings.window)
-    problem = ObservationModel(window, rig, model_of(config), settings.min_speed, settings.max_turn)
+    window = bins_of(config, channels).window(0.0, settings.window)
+    problem = ObservationModel(window, rig_of(config), model_of(config), settings.min_speed, settings.max_turn)
     return problem, prior_about(prior_of(config), soil_named(task.soil), np.random.default_rng([task.seed, 1]))
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import NamedTuple
 
 from scipy.special import gammaincinv
 
+from soilbus.pipeline.outputs import known
 from soilbus.report.table import table
 from soilbus.validation.bogging_trials import (
     MIN_LEAD_DISTANCE,
@@ -148,37 +150,16 @@ def as_json(
     drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]
 ) -> dict[str, object]:
     """The figures as plain objects; null for what is not a number."""
-
-    def number(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    return {
-        "max_draft": [
-            {
-                "soil": d.soil, "drives": d.drives, "failed": d.failed, "error": number(d.error),
-                "bias": number(d.bias), "coverage": number(d.coverage), "true": number(d.true),
-            }
-            for d in drafts
-        ],
-        "calls": {
-            "drives": calls.drives, "failed": calls.failed, "brier": number(calls.brier),
-            "brier_expected": number(calls.brier_expected), "brier_std": calls.brier_std,
-            "excess": number(calls.excess), "go": calls.go, "wrong_go": calls.wrong_go,
-            "wrong_go_expected": calls.wrong_go_expected,
-            "bins": [
-                {
-                    "low": b.low, "high": b.high, "calls": b.calls, "mean": number(b.mean),
-                    "true": number(b.true), "least": b.least, "most": b.most,
-                }
-                for b in calls.bins
-            ],
-        },
+    figures: dict[str, object] = known({
+        "max_draft": [asdict(of_soil) for of_soil in drafts],
+        "calls": asdict(calls),
         "immobilisation": {
             w.kind: {
-                "boggings": w.boggings, "in_time": w.warned, "lead": number(w.lead), "least_lead": number(w.least),
-                "sudden": w.sudden, "delay": number(w.delay), "hours": w.hours, "false": w.false,
+                "boggings": w.boggings, "in_time": w.warned, "lead": w.lead, "least_lead": w.least,
+                "sudden": w.sudden, "delay": w.delay, "hours": w.hours, "false": w.false,
             }
             for w in warnings
         },
         "false_warnings": {name: found._asdict() for name, found in _pooled(warnings).items()},
-    }  # fmt: skip
+    })  # fmt: skip
+    return figures

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,20 +20,17 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import assess
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
-from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.estimation.window import Rig, pairs
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
-from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.validation.monte_carlo import MAX_SOIL_DRAWS, Each, prior_about
-from soilbus.validation.windows import torque_limits
+from soilbus.validation.monte_carlo import Each, first_drive, prior_about
+from soilbus.validation.windows import observed, torque_limits
 
 __all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
 
@@ -78,10 +74,8 @@ class DraftFigures:
     true: float
 
 
-def draft_trials(
-    config: Config, drives: int, seed: int, soils: Sequence[str] = SOILS, each: Each = map
-) -> Iterator[DraftFigures]:
-    """Figures of each soil, then of all soils.
+def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> Iterator[DraftFigures]:
+    """Figures of each of SOILS, then of all.
 
     Parameters
     ----------
@@ -91,20 +85,16 @@ def draft_trials(
         Number on each soil.
     seed
         The same seed gives the same drives.
-    soils
-        Names of the table.
     each
         The built-in map, or that of monte_carlo.processes.
 
     Raises
     ------
-    KeyError
-        A soil is unknown.
     SimulationError
         The tractor cannot drive on one.
     """
     everything: list[DraftTrial] = []
-    for name in soils:
+    for name in SOILS:
         key = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
         tasks = [Task(config, name, int(s)) for s in key.generate_state(drives)]
         everything += (of_soil := list(each(trial, tasks)))
@@ -116,12 +106,9 @@ def trial(task: Task) -> DraftTrial:
     """Simulate one drive, estimate, predict, and solve for the true draft."""
     config, name, seed = task
     soil, recording = _driven(task)
-    duration = config.estimator.window
     rig, model, settings = rig_of(config), model_of(config), config.traversability
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
-    fit = cold_fit(ObservationModel(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
+    fit = cold_fit(observed(config, recording.channels, config.estimator.window), prior)
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     truth = true_largest_draft(
         soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law), np.inf, drivetrain_of(config)
@@ -140,13 +127,13 @@ def _driven(task: Task) -> tuple[Soil, Recording]:
     """The first soil drawn about the named one on which the vehicle gets on, and the drive over it."""
     config, name, seed = task
     rng = np.random.default_rng([seed, 2])
-    for left in reversed(range(MAX_SOIL_DRAWS)):
+
+    def draw() -> tuple[Soil, Scenario]:
         soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
         slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
-        scenario = Scenario(config.estimator.window, (Patch(0.0, name, soil),), slip=slip)
-        with suppress(SimulationError) if left else nullcontext():
-            return soil, simulate(config, scenario, seed)
-    raise AssertionError("the last draw returns or raises")
+        return soil, Scenario(config.estimator.window, (Patch(0.0, name, soil),), slip=slip)
+
+    return first_drive(config, draw, seed)
 
 
 def true_largest_draft(

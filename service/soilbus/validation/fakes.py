@@ -1,4 +1,4 @@
-"""A bus, a clock, workers and a service on them that tests hold in their hands, and frames of a drive."""
+"""Scripted bus, clock and workers for tests, a service on them, and the frames of a simulated drive."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ __all__ = ["Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "ScriptedBus"
 FakeClock = PlayedClock
 
 
-def drive_messages(config: Config, seconds: float, seed: int = 3) -> list[can.Message]:
+def drive_messages(config: Config, seconds: float) -> list[can.Message]:
     """Frames of a good drive on loam: draft swings, slip is what the soil asks for."""
-    return list(frames(simulate(config, excited("loam", seconds), seed), config))
+    return list(frames(simulate(config, excited("loam", seconds), 3), config))
 
 
 def feed_message(admission: Admission, message: can.Message) -> None:

@@ -158,11 +158,6 @@ def faults_of(seed: int) -> dict[int, Fault]:
     return dict(zip(rng.choice(VEHICLES, 3, replace=False).tolist(), kinds, strict=True))
 
 
-def fleet_of(seed: int, shared: Sequence[Fault]) -> Fleet:
-    """Three vehicles with faults, and one of these effects of the type by turns; or none."""
-    return fleet(seed, faults_of(seed), shared[seed % len(shared)] if shared else None)
-
-
 class Rivalry(NamedTuple):
     """What the logs that have a fault, which is all that is hidden in them, show of it.
 
@@ -232,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for effects in (shared,) if chosen.only_shared else (shared, ()):
         faults = found = since = types = types_found = sound = sound_named = true = given = 0
         for seed in range(chosen.seed, chosen.seed + chosen.fleets):
-            of = fleet_of(seed, effects)
+            of = fleet(seed, faults_of(seed), effects[seed % len(effects)] if effects else None)
             names = names_given(of)
             right = [one for one in names if is_true(one, of)]
             print(f"seed {seed}, {of.shared and of.shared.form}, {dict(of.faults)}:", flush=True)

@@ -15,17 +15,17 @@ import numpy as np
 
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+from soilbus.validation.windows import observed
 
 __all__ = [
     "EXCITED",
@@ -101,11 +101,9 @@ def window(
 ) -> ObservationModel:  # fmt: skip
     """A window of a simulated drive on a known soil."""
     scenario = Scenario(seconds, (Patch(0.0, soil),), slip=slip, side_shift=side_shift)
-    rig, channels = rig_of(config), simulate(config, scenario, seed).channels
-    wanted = [c for c in rig.channels if c in channels and (sinkage or not c.startswith("sinkage"))]
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({c: (channels[c].t, channels[c].value) for c in wanted})
-    return ObservationModel(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
+    channels = simulate(config, scenario, seed).channels
+    wanted = {name: c for name, c in channels.items() if sinkage or not name.startswith("sinkage")}
+    return observed(config, wanted, seconds)
 
 
 def c_and_K_known(soil: str) -> list[str]:

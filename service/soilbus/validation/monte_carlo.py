@@ -11,7 +11,6 @@ soils drawn around the named one (`around`).
 
 from __future__ import annotations
 
-import math
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,16 +33,16 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
-from soilbus.sensors.bins import Bins
+from soilbus.pipeline.outputs import known
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.simulator.sensors import true_readings
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 from soilbus.validation.bayes_risk_bound import BayesRisk, bayes_risk
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import sample_posterior
+from soilbus.validation.windows import bins_of, exact
 from soilbus.workers import workers
 
 __all__ = [
@@ -57,6 +56,7 @@ __all__ = [
     "Trial",
     "as_json",
     "driven",
+    "first_drive",
     "monte_carlo",
     "prior_about",
     "problem_of",
@@ -73,8 +73,8 @@ SLIP_RANGE = Swing(0.05, 0.40)
 """Slip of every drive."""
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-MAX_SOIL_DRAWS = 20
-"""Soils around a named one that are tried until the tractor can drive."""
+MAX_DRAWS = 100
+"""Drawn scenarios that are tried until the tractor drives one to its end."""
 _PHI = PARAMETERS.index("phi")
 
 
@@ -275,14 +275,30 @@ def driven(task: Task) -> tuple[Recording, Soil]:
     config, name, duration, seed, _, around = task
     rng, named = np.random.default_rng([seed, 3]), soil_named(name)
     spread = np.where(prior_of(config).log_std > 0.0, around, 0.0)
-    for _ in range(MAX_SOIL_DRAWS if around else 1):
-        soil = prior_about(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
-        of_drive = Soil(*soil.tolist())
-        with suppress(SimulationError) if around else nullcontext():
-            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP_RANGE), seed)
+
+    def draw() -> tuple[Soil, Scenario]:
+        median = prior_about(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
+        soil = Soil(*median.tolist())
+        return soil, Scenario(duration, (Patch(0.0, name, soil),), slip=SLIP_RANGE)
+
+    soil, recording = first_drive(config, draw, seed, MAX_DRAWS if around else 1)
+    return recording, soil
+
+
+def first_drive(
+    config: Config, draw: Callable[[], tuple[_T, Scenario]], seed: int, draws: int = MAX_DRAWS
+) -> tuple[_T, Recording]:
+    """The first drawn scenario that the vehicle drives to its end, as what was drawn with it and the recording.
+
+    Raises SimulationError, that of the last scenario, where the vehicle drives none of `draws`.
+    """
+    for left in reversed(range(draws)):
+        drawn, scenario = draw()
+        with suppress(SimulationError) if left else nullcontext():
+            recording = simulate(config, scenario, seed)
             if recording.bogged_at is None:
-                return recording, of_drive
-    raise SimulationError(f"the tractor gets stuck on {name}")
+                return drawn, recording
+    raise SimulationError(f"the tractor gets stuck on {scenario.soils[0].name}")
 
 
 def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
@@ -322,18 +338,14 @@ def problem_of(
     recording: Recording, config: Config, duration: float, names: Iterable[str], of_truth: bool
 ) -> ObservationModel:
     """The window of these channels as measured, or as it truly was at the times of the samples."""
-    rig, truth = rig_of(config), recording.truth
     columns = {name: recording.channels[name] for name in names}
-    readings = true_readings(truth, config, columns) if of_truth else {}
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({
-        name: (column.t, np.interp(column.t, truth["t"], readings[name]) if of_truth else column.value)
-        for name, column in columns.items()
-    })  # fmt: skip
-    window, settings = store.window(0.0, duration), config.estimator
+    if of_truth:
+        columns = exact(recording, config, columns)
+    window, settings = bins_of(config, columns).window(0.0, duration), config.estimator
     return ObservationModelWithEffects(
-        window, rig, model_of(config), settings.min_speed, settings.max_turn, *effects_and_parameters_of(config)
-    )
+        window, rig_of(config), model_of(config), settings.min_speed, settings.max_turn,
+        *effects_and_parameters_of(config),
+    )  # fmt: skip
 
 
 def _logarithms(posterior: Posterior, config: Config) -> tuple[Array, Array]:
@@ -401,19 +413,16 @@ def _bayes_risk_figures(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Ba
 
 def as_json(cell: Cell) -> dict[str, Any]:
     """The cell's figures as plain objects; null for what is not a number."""
-
-    def number(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
     columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
     if cell.bayes_risk is not None:
         columns |= {"least": cell.bayes_risk.least, "least_scatter": cell.bayes_risk.least_scatter}
         columns |= {"best": cell.bayes_risk.best, "rms_beside_best": cell.bayes_risk.ours}
-    return {
+    figures: dict[str, Any] = known({
         "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
-        "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,
+        "failed": cell.failed, "not_converged": cell.not_converged, "chi2": cell.chi2, "seconds": cell.seconds,
         "quantities": {
-            name: {figure: number(float(column[i])) for figure, column in columns.items()}
+            name: {figure: float(column[i]) for figure, column in columns.items()}
             for i, name in enumerate(cell.quantities)
         },
-    }  # fmt: skip
+    })  # fmt: skip
+    return figures

@@ -245,14 +245,14 @@ class WheelEquations:
             done, converged = done + 1, abs(change) <= N_STEP_TOLERANCE
         return Solution(Unknowns(K_L, math.atan2(s, K_L), n), done, converged)
 
-    def all_solutions(self, measured: Forces, largest_n: float = 3.0, steps: int = 100) -> list[Unknowns]:
-        """Every soil with n up to largest_n that solves the equations, from no particular start.
+    def all_solutions(self, measured: Forces) -> list[Unknowns]:
+        """Every soil with n up to 3 that solves the equations, from no particular start.
 
         Notes
         -----
-        They are where the residual of the drawbar pull changes sign on `steps` equal steps of n.
+        They are where the residual of the drawbar pull changes sign on 100 equal steps of n.
         """
-        n = np.linspace(largest_n / steps, largest_n, steps)
+        n = np.linspace(0.03, 3.0, 100)
         b, a, w, d, t = self._rows[:5] @ self._z[:, None] ** n
         W, DP, T = self._from_normal_stress(measured)
         with np.errstate(all="ignore"):  # measured may be anything

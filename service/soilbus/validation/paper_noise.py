@@ -29,6 +29,9 @@ __all__ = ["LEVELS", "Noise", "best_depth", "bounds", "cramer_rao", "one_instant
 RIM_SPEED = 1.0
 """Of the window's wheel [m/s]; the ground speed's noise then is that of the slip."""
 
+INSTANTS = 100
+"""Of the window."""
+
 
 class Noise(NamedTuple):
     """Standard deviations: relative of W, DP and T, absolute of sinkage [m] and slip [-]."""
@@ -84,7 +87,7 @@ def relative_errors(found: Array, truth: Unknowns, depth: float) -> Array:
     return np.asarray(np.column_stack([found / true, pressure]) - 1.0)
 
 
-def one_instant(trial: Trial, depth: float, noise: Noise, draws: int, seed: int, equations: Equations = EXACT) -> Array:
+def one_instant(trial: Trial, depth: float, noise: Noise, draws: int, seed: int) -> Array:
     """Soils (N, 3) from `draws` noisy instants at a sinkage [m]; N counts those that have any solution.
 
     Data and solver share the equations, so noise is all that is wrong; of several
@@ -92,17 +95,17 @@ def one_instant(trial: Trial, depth: float, noise: Noise, draws: int, seed: int,
     """
     rng = np.random.default_rng(seed)
     point, truth = trial.at(depth), trial.truth
-    exact = np.array([*WheelEquations(point, equations).forces(truth), depth, point.slip])
+    exact = np.array([*WheelEquations(point, EXACT).forces(truth), depth, point.slip])
     sd = np.array(noise) * np.array([*np.abs(exact[:3]), 1.0, 1.0])
     found: list[Unknowns] = []
     for W, DP, T, z, slip in (exact + sd * rng.standard_normal((draws, 5))).tolist():
         if 0.0 < z < trial.radius:
-            ends = WheelEquations(trial.at(z, slip), equations).all_solutions(Forces(W, DP, T))
+            ends = WheelEquations(trial.at(z, slip), EXACT).all_solutions(Forces(W, DP, T))
             found += sorted(ends, key=lambda end: abs(math.log(end.K_L / truth.K_L)))[:1]
     return np.array(found).reshape(-1, 3)
 
 
-def windows_of(trial: Trial, depth: float, noise: Noise, windows: int, seed: int, instants: int = 100) -> Array:
+def windows_of(trial: Trial, depth: float, noise: Noise, windows: int, seed: int) -> Array:
     """Soils (N, 3) by our estimator from windows of noisy instants; N counts the fits that converged.
 
     Load +-30 % about that of the sinkage [m], slip 0.05 to 0.4; the shear law is the
@@ -112,16 +115,16 @@ def windows_of(trial: Trial, depth: float, noise: Noise, windows: int, seed: int
     rng = np.random.default_rng(seed)
     model = WheelModel(shear_law="rational")
     rig, prior = _rig(trial, noise), _prior(trial)
-    load, slip, pull, torque, z = _drive(trial, depth, model, instants)
+    load, slip, pull, torque, z = _drive(trial, depth, model, INSTANTS)
     found = []
     for _ in range(windows):
-        by_W, by_DP, by_T, by_z, by_slip = np.array(noise)[:, None] * rng.standard_normal((5, instants))
+        by_W, by_DP, by_T, by_z, by_slip = np.array(noise)[:, None] * rng.standard_normal((5, INSTANTS))
         samples = {
             "load.wheel": load * (1.0 + by_W), "draft": pull * (1.0 + by_DP), "torque.wheel": torque * (1.0 + by_T),
             "sinkage.wheel": z + by_z, "ground_speed": RIM_SPEED * (1.0 - slip - by_slip),
-            "speed.wheel": np.full(instants, RIM_SPEED / trial.radius),
+            "speed.wheel": np.full(INSTANTS, RIM_SPEED / trial.radius),
         }  # fmt: skip
-        window = window_of_samples(rig, np.arange(instants, dtype=np.float64), samples)
+        window = window_of_samples(rig, np.arange(INSTANTS, dtype=np.float64), samples)
         fit = fit_window(ObservationModel(window, rig, model, 0.1), prior)
         if fit is not None and fit.converged:
             soil = fit.posterior.soil

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import textwrap
-import time
-from collections.abc import Callable
+import timeit
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 from scipy.optimize import brentq
@@ -107,7 +105,7 @@ def what_holds(sinkage: float) -> list[str]:
     K_L = " or ".join(f"K_L = {x.K_L / 1e3:.0f}" for x in found) or "no solution"
     off = min((100.0 * abs(x.K_L / truth.K_L - 1.0) for x in found), default=math.inf)
     bound = 100.0 * K_L_bound(sinkage, LEVELS["0.1 %"], EXACT)
-    seconds = max(_seconds(partial(_newton, run, sinkage)) for run in RUNS)
+    seconds = max(_seconds(run, sinkage) for run in RUNS)
     fastest = min(run.seconds for run in RUNS)
     return [
         f"Convergence {_verdict(len(steps) == len(RUNS) and max(errors) < MAX_SOLUTION_ERROR)} for its start values: "
@@ -177,14 +175,9 @@ def _one_step(run: Run, sinkage: float) -> Unknowns:
     return wheel.newton(wheel.forces(run.trial.truth), from_print(run.result), most=1).end
 
 
-def _seconds(work: Callable[[], object]) -> float:
-    """Shortest wall time of several runs."""
-    times = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begin)
-    return min(times)
+def _seconds(run: Run, sinkage: float) -> float:
+    """Shortest wall time of the paper's iteration."""
+    return min(timeit.repeat(lambda: _newton(run, sinkage), number=1, repeat=REPEATS))
 
 
 class PaperRow(NamedTuple):
@@ -240,7 +233,7 @@ def paper_table(number: int, sinkage: float) -> PaperTable:
         Of the simulated wheels [m].
     """
     runs = [run for run in RUNS if run.table == number]
-    ours = [(_newton(run, sinkage), _seconds(partial(_newton, run, sinkage))) for run in runs]
+    ours = [(_newton(run, sinkage), _seconds(run, sinkage)) for run in runs]
     rows = []
     for i, name in enumerate(DECIMALS):
         for run, (end, seconds) in zip(runs, ours, strict=True):

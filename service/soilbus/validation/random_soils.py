@@ -1,4 +1,4 @@
-"""What follows from a posterior by plain Monte Carlo: random soils in the place of its sigma points."""
+"""Capability of a posterior by plain Monte Carlo: random soils in place of its sigma points."""
 
 from __future__ import annotations
 

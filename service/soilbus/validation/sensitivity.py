@@ -48,7 +48,6 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -60,6 +59,7 @@ from soilbus.validation.boggings import KINDS
 from soilbus.validation.curved_drives import curved
 from soilbus.validation.driven_windows import task_of, windows
 from soilbus.validation.firm_drives import EASY, FIRM_KINDS
+from soilbus.validation.windows import bins_of
 
 FACTORS = (0.7, 1.3)
 HEAD = "| option | value | unit | -30 % | +30 % |"
@@ -257,13 +257,11 @@ def recorded() -> tuple[Recorded, ...]:
 
 def _recorded(name: str) -> Recorded:
     case = next(case for case in cases(name.partition("/")[0], 501) if case.id.startswith(name))
-    rig = rig_of(case.config)
-    store = Bins(rig, case.config.estimator.bin, 0.0)
-    store.add({n: (c.t, c.value) for n, c in case.recording.channels.items() if n in rig.channels})
+    store = bins_of(case.config, case.recording.channels)
     parts = 2 if name == list(CASES)[-1] else 1
     found = tuple(store.window(SECONDS * i, SECONDS * (i + 1)) for i in range(parts))
     effects = [e for e in possible_effects(case.config) if not CASES[name] or e.name in CASES[name]]
-    return Recorded(case, found, rig, prior_of(case.config), tuple(effects))
+    return Recorded(case, found, store.rig, prior_of(case.config), tuple(effects))
 
 
 def diagnoses(options: DiagnosisOptions) -> list[Diagnosed]:

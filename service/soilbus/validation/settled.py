@@ -4,9 +4,9 @@
     wrong      the same, another effect
     open       still ambiguous, or unknown
 
-Beside it the same cases after as long a drive like the first one: what more of the same settles.  The drive is that of
-the blind generator, with the hidden effect in its own formula (`soilbus.validation.blind`); recordings have one field
-and one vehicle, and own noise.
+For comparison, the same cases after a drive of the same length that repeats the first one.  Both are driven by the
+blind generator, with the hidden effect in its own formula (`soilbus.validation.blind`), on the same field by the same
+vehicle, with noise of their own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from soilbus.validation.blind.cases import Case, cases
 
 KINDS = ("right", "wrong", "open")
 MAX_DRIVES = 4
-"""How often the manoeuvre is driven at most, whatever the plan says: three minutes."""
+"""Repetitions of the manoeuvre at most, where the plan asks for more: three minutes."""
 
 
 def driven(case: Case, scenario: Scenario, seed: int) -> Diagnosis:

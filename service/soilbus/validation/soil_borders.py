@@ -1,8 +1,8 @@
 """Drives over borders: how soon a valid estimate of the new soil comes, and whether any valid one is wrong.
 
-A window is valid where it knows the bearing pressure of a plate at a given depth.  However
-little the loads change, it knows sooner what its own tyres measure: the pressure under each of them
-at about half its depth, and tan phi.  The table has from when, and whether that is wrong.
+A window is valid once it determines the bearing pressure of a plate at a given depth.  It determines the pressure under
+its own tyres at about half their sinkage, and tan phi, sooner, even where loads hardly change.  The table has the time
+of both after the border, and the number of wrong windows.
 
 `python -m soilbus.validation.soil_borders [loam:wet_clay …] [--speeds 1.5] [--transition 1] [--seeds 20] [--first 1]`
 prints a table; `--windows` every window near the border besides.
@@ -24,13 +24,13 @@ from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import new_soil_prior
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.wheel import Soil
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.driven_windows import errors, sweep, task_of, windows
+from soilbus.validation.windows import bins_of, exact
 
 PAIRS = ("loam:wet_clay", "wet_clay:loam", "loam:clayey_soil_38", "clayey_soil_38:loam")
 BEFORE, AFTER = 15.0, 10.0
@@ -143,10 +143,7 @@ def least_sd(config: Config, driven: Drive, t: float) -> float:
     recording, end = driven.recording, driven.left + t
     rig = rig_of(config)
     rig = replace(rig, noise={name: noise._replace(gain=0.0) for name, noise in rig.noise.items()})
-    store = Bins(rig, config.estimator.bin, 0.0)
-    channels, truth = recording.channels, recording.truth
-    times = {name: channels[name].t for name in rig.channels if name in channels}
-    store.add({name: (at, np.interp(at, truth["t"], truth[name])) for name, at in times.items()})
+    store = bins_of(config, exact(recording, config, recording.channels))
     border = Transition(driven.on, driven.on, driven.left - driven.on)
     window = without_transition(store.window(driven.on, end), border, rig.front)
     settings = config.estimator

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,17 +36,14 @@ from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import VEHICLE_QUANTITIES, Rig, Window, forward
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.drivetrain import drivetrain_of
-from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
-from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
-from soilbus.validation.monte_carlo import Each, prior_about
-from soilbus.validation.windows import task_of, torque_limits
+from soilbus.validation.monte_carlo import Each, first_drive, prior_about
+from soilbus.validation.windows import bins_of, exact, task_of, torque_limits
 
 SOIL_LOG_SD = 0.2
 """Standard deviation of the logarithms of a drive's soil parameters about the table's soil."""
@@ -60,7 +57,6 @@ MIN_PROBABILITY = 1e-3
 """Least and, from 1, greatest probability that a margin near the limit is drawn for."""
 BINS = 10
 """Equal intervals of probability."""
-MAX_DRAWS = 100
 
 
 class Task(NamedTuple):
@@ -209,17 +205,13 @@ def _can(config: Config, ground: Ground, settings: Settings, asked: float) -> bo
 
 def _driven(config: Config, seed: int, rng: np.random.Generator) -> tuple[Ground, Recording]:
     """The first ground drawn that the vehicle can cross for a window, and the drive over it."""
-    for _ in range(MAX_DRAWS):
+
+    def draw() -> tuple[Ground, Scenario]:
         ground = _ground(config, rng)
         slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
-        scenario = Scenario(config.estimator.window, (Patch(0.0, ground.name, ground.soil),), slip=slip)
-        try:
-            recording = simulate(config, scenario, seed)
-        except SimulationError:
-            continue
-        if recording.bogged_at is None:
-            return ground, recording
-    raise SimulationError(f"no ground of {MAX_DRAWS} can be driven on")
+        return ground, Scenario(config.estimator.window, (Patch(0.0, ground.name, ground.soil),), slip=slip)
+
+    return first_drive(config, draw, seed)
 
 
 def _ground(config: Config, rng: np.random.Generator) -> Ground:
@@ -239,19 +231,10 @@ def _ground(config: Config, rng: np.random.Generator) -> Ground:
 
 def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> Window:
     """The window as measured, or as the vehicle's own quantities truly were at the times of the samples."""
-    columns = {n: c for n in rig.channels if (c := recording.channels.get(n)) is not None}
+    columns: Mapping[str, Column] = recording.channels
     if of_truth:
-        truth, mapped = dict(recording.truth), config.signals.acceleration
-        if mapped is not None and mapped.kind == "specific_force":
-            truth["acceleration"] = truth["acceleration"] + GRAVITY * np.sin(truth["pitch"])
-        columns = {
-            n: Column(c.t, np.interp(c.t, truth["t"], truth[n]))
-            for n, c in columns.items()
-            if n in VEHICLE_QUANTITIES and n in truth
-        }
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({n: (c.t, c.value) for n, c in columns.items()})
-    return completed(forward(store.window(0.0, config.estimator.window)), rig)
+        columns = exact(recording, config, [name for name in columns if name in VEHICLE_QUANTITIES])
+    return completed(forward(bins_of(config, columns).window(0.0, config.estimator.window)), rig)
 
 
 def reliability(calls: Sequence[Call]) -> Reliability:

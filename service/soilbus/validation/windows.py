@@ -1,15 +1,42 @@
-"""Windows of simulated channels as tasks for the service's own estimator."""
+"""Windows of simulated channels: in bins, as observations, and as tasks for the service's own estimator."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.can.channels import Column
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import motors_of
+from soilbus.estimation.assembly import model_of, motors_of, rig_of
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
-from soilbus.pipeline.positions import PositionTrack
+from soilbus.sensors.bins import Bins
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.sensors import true_readings
+
+
+def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
+    """The samples of those channels that the configured rig has, in bins from 0 s on."""
+    rig = rig_of(config)
+    bins = Bins(rig, config.estimator.bin, 0.0)
+    bins.add({name: (c.t, c.value) for name in rig.channels if (c := channels.get(name)) is not None})
+    return bins
+
+
+def exact(recording: Recording, config: Config, names: Iterable[str]) -> dict[str, Column]:
+    """What sensors without errors and effects would have read at the times of these channels' samples."""
+    truth, times = recording.truth, {name: recording.channels[name].t for name in names}
+    readings = true_readings(truth, config, times)
+    return {name: Column(t, np.interp(t, truth["t"], readings[name])) for name, t in times.items()}
+
+
+def observed(config: Config, channels: Mapping[str, Column], duration: float) -> ObservationModel:
+    """The first `duration` [s] of the channels as one window to be fitted, without effects."""
+    window = bins_of(config, channels).window(0.0, duration)
+    return ObservationModel(window, rig_of(config), model_of(config), config.estimator.min_speed)
 
 
 def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:
@@ -39,10 +66,6 @@ def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np
         end=end,
         window=window,
         slip={wheel.name: None for wheel in config.wheel},
-        missing=(),
-        poor=(),
         torque_limit=torque_limit,
-        track=PositionTrack({}),
-        rejected={},
         fresh=fresh,
     )

@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from timeit import timeit
 
 import numpy as np
 
@@ -129,7 +130,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
 
 def _latency(late: Array, pause: float) -> Figure:
     """Of the windows' results (windows,) [s]; pause is the longest time [s] in which no frame came."""
-    call = _time_of_a_call()
+    call = timeit(os.getppid, number=N_SYSTEM_CALLS) / N_SYSTEM_CALLS
     return Figure(
         1e3 * float(np.sort(late)[math.ceil(0.99 * len(late)) - 1]), 50.0,
         f"median {1e3 * np.median(late):.1f}, worst {1e3 * late.max():.0f}",
@@ -139,14 +140,6 @@ def _latency(late: Array, pause: float) -> Figure:
             "as when a machine stands still.",
         ),
     )  # fmt: skip
-
-
-def _time_of_a_call() -> float:
-    """Time [s] of one cheap system call."""
-    begin = time.perf_counter()
-    for _ in range(N_SYSTEM_CALLS):
-        os.getppid()
-    return (time.perf_counter() - begin) / N_SYSTEM_CALLS
 
 
 def _wait_until_counted(ear: Ear) -> None:

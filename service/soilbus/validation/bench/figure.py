@@ -1,4 +1,4 @@
-"""One figure of the bench, and how times are taken on a machine that does other things too.
+"""One figure of the bench, and the timing of code on a machine with other load.
 
 time = least of several runs: other load only adds
 """
@@ -6,6 +6,7 @@ time = least of several runs: other load only adds
 from __future__ import annotations
 
 import time
+import timeit
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -46,7 +47,7 @@ class Figure:
 
 def wall_time(work: Callable[[], Any], repeats: int) -> float:
     """Shortest wall time of several runs [s]: what else the machine does only adds."""
-    return min(_timed(work, time.perf_counter) for _ in range(repeats))
+    return min(timeit.repeat(work, number=1, repeat=repeats))
 
 
 def in_turn(works: Sequence[Callable[[], Any]], rounds: int) -> NDArray[np.float64]:
@@ -54,11 +55,5 @@ def in_turn(works: Sequence[Callable[[], Any]], rounds: int) -> NDArray[np.float
 
     So a busy machine slows all of them alike.
     """
-    times = [[_timed(work, time.process_time) for work in works] for _ in range(rounds)]
+    times = [[timeit.timeit(work, timer=time.process_time, number=1) for work in works] for _ in range(rounds)]
     return np.asarray(np.min(times, axis=0))
-
-
-def _timed(work: Callable[[], Any], clock: Callable[[], float]) -> float:
-    begin = clock()
-    work()
-    return clock() - begin

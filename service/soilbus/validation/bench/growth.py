@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.can.channels import Column
 from soilbus.config.model import Config, Wheel
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.validation.bench.figure import Figure, in_turn
+from soilbus.validation.windows import observed
 
 WHEELS = (1, 2, 4, 8)
 WINDOW_LENGTHS = (5.0, 10.0, 20.0, 40.0)
@@ -107,17 +108,14 @@ def problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
     """Windows of all lengths of a tractor with this number of wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
     recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
-    samples = {name: (column.t, column.value) for name, column in recording.channels.items()}
+    channels = dict(recording.channels)
     if wheels == 1:
         config = config.model_copy(update={"wheel": config.wheel[:1], "vehicle": None})
         pull = recording.truth[f"drawbar_pull.{config.wheel[0].name}"]
         noise = config.noise.draft.absolute * np.random.default_rng(1).standard_normal(len(pull))
-        samples["draft"] = recording.truth["t"], pull + noise
-    rig, settings = rig_of(config), config.estimator
-    store = Bins(rig, settings.bin, 0.0)
-    store.add({name: samples[name] for name in rig.channels if name in samples})
+        channels["draft"] = Column(recording.truth["t"], pull + noise)
     for length in WINDOW_LENGTHS:
-        yield ObservationModel(store.window(0.0, length), rig, model_of(config), settings.min_speed), prior_of(config)
+        yield observed(config, channels, length), prior_of(config)
 
 
 def _configuration(wheels: int) -> Config:

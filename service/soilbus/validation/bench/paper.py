@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
+from functools import partial
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,8 @@ def paper_solve_speedup() -> Figure:
     if not apart < MAX_RELATIVE_DIFFERENCE:
         raise AssertionError(f"ours and fsolve are {apart:.1e} apart")
     times = np.array([
-        [(_seconds(peer, p, 1), _seconds(ours, p, SOLVES) / SOLVES) for p in problems] for _ in range(ROUNDS)
+        [(timeit(partial(peer, p), number=1), timeit(partial(ours, p), number=SOLVES) / SOLVES) for p in problems]
+        for _ in range(ROUNDS)
     ])  # fmt: skip
     slow, fast = times.min(axis=0).mean(axis=0).tolist()
     return Figure(
@@ -105,10 +107,3 @@ def balance(point: OperatingPoint, measured: Forces) -> Callable[[Any], list[flo
         ]
 
     return left
-
-
-def _seconds(solve: Callable[[Problem], object], problem: Problem, repeats: int) -> float:
-    begin = time.perf_counter()
-    for _ in range(repeats):
-        solve(problem)
-    return time.perf_counter() - begin

@@ -15,11 +15,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soilbus.arrays import Array
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, diagonals
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -27,6 +26,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 from soilbus.validation.bench.figure import Figure, in_turn
+from soilbus.validation.windows import observed
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 EXACT_AND_ROUGH = (("c", "K"), ("K", "c"))
@@ -168,9 +168,5 @@ def window_of(name: str, exact: str, rough: str) -> Window:
         f"soil.{rough}.value={median}", f"soil.{rough}.std={0.25 * median}",
         *(f"noise.{quantity}.gain=0" for quantity in ("torque", "load", "speed", "ground_speed", "draft")),
     ])  # fmt: skip
-    rig, settings = rig_of(config), config.estimator
     channels = simulate(config, excited(name, WINDOW_LENGTH), seed=1).channels
-    store = Bins(rig, settings.bin, 0.0)
-    store.add({n: (channels[n].t, channels[n].value) for n in rig.channels if n in channels})
-    problem = ObservationModel(store.window(0.0, WINDOW_LENGTH), rig, model_of(config), settings.min_speed)
-    return Window(problem, prior_of(config))
+    return Window(observed(config, channels, WINDOW_LENGTH), prior_of(config))

@@ -2,8 +2,8 @@
 
     E = min over soil and gains of  chi-square + their prior,  of the drive without sensors' noise
 
-What computed loads leave open is in the weights, soil and gains are as open as in the diagnosis.  E is by how much
--2 log likelihood is expected to fall with the true effect at its true size, by its own formula, against no effect.
+The weights contain the uncertainty of computed loads; soil and gains have the priors of the diagnosis.  E is the
+expected fall of -2 log likelihood from no effect to the true effect at its true size, by its own formula.
 """
 
 from __future__ import annotations

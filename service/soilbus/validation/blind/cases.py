@@ -184,9 +184,7 @@ def _configured(kind: str, config: Config, soil: Soil, with_sinkage: bool, rng: 
         prior[parameter] = Prior(value=value, std=high * value)
     config = config.model_copy(update={"soil": config.soil.model_copy(update=prior)})
     if hard:
-        channels = {q: getattr(config.noise, q) for q in type(config.noise).model_fields}
-        louder = {q: noise.model_copy(update={"gain": 3.0 * noise.gain}) for q, noise in channels.items()}
-        config = config.model_copy(update={"noise": config.noise.model_copy(update=louder)})
+        config = config.model_copy(update={"noise": config.noise.scaled(3.0, "gain")})
         if rng.integers(2) and config.signals.pitch is not None:
             config = config.model_copy(update={"signals": config.signals.model_copy(update={"acceleration": None})})
     if not with_sinkage:

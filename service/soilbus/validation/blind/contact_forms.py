@@ -1,4 +1,4 @@
-"""Hidden effects where wheel and soil touch: soil pushed ahead, lugs, shape of the contact, a soft tyre."""
+"""Hidden effects of the contact: bulldozing, lugs, peak stress, exit angle, shear law, tyre deflection."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Hidden effects in forms that came later, after the catalogue had taken on some of the others' formulas.
+"""Hidden effects by further formulas, added when the catalogue had adopted some of the first ones.
 
-They follow the others in the list of forms, so that cases of those stay what they were.
+They stand behind the first in the list of forms, so that the cases of these keep their seeds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hidden effects: channels other than the torque that come late.  They follow all others in the list of forms."""
+"""Hidden effects: delays of channels other than the torque.  They stand last in the list of forms."""
 
 from __future__ import annotations
 

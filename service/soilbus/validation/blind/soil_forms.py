@@ -1,4 +1,4 @@
-"""Hidden effects of the soil: dug out, driven over, hurried, layered, changing along the field."""
+"""Hidden effects of the soil: slip sinkage, compacted ruts, stiffening by rate, a hardpan, drift along the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the trials come to: shares with their targets, confusion matrix, calibration of probabilities."""
+"""Score of the blind trials: shares with their targets, confusion matrix, calibration of probabilities."""
 
 from __future__ import annotations
 

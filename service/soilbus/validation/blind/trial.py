@@ -1,4 +1,4 @@
-"""One blind case through the diagnosis, and what there is to score of it."""
+"""A blind trial: one case diagnosed, and the figures that are scored."""
 
 from __future__ import annotations
 

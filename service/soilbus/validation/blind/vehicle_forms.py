@@ -1,4 +1,4 @@
-"""Hidden effects of the vehicle and its sensors: drive line, load cells, tyres, slopes, masses."""
+"""Hidden effects of the vehicle and its sensors: drive line losses, lags, slope, draft, loads, radius, inertia."""
 
 from __future__ import annotations
 

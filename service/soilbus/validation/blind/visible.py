@@ -1,14 +1,14 @@
-"""How much of a hidden effect a recording shows at all, by the generator alone: nothing of the diagnosis is asked.
+"""How much of a hidden effect a recording can show at all, computed without any code of the diagnosis.
 
 The tractor drives without noise and gain errors, with the effect and without.  The plain wheel-soil model h (the rim
 integral beside this file) is fitted to the readings y of the drive with it.  Unknown are the latents x of each
-instant (entry angles, slips, motion) and, over the whole drive, what the configuration knows more or less: the
-soil and the gain errors g, together q.
+instant (entry angles, slips, motion) and, for the whole drive, the soil and the gain errors g, together q, with the
+priors of the configuration.
 
     E = min over x, q of |S^-1 (y - d - (1 + g) h(x, soil))|^2 + |q / sd(q)|^2
 
-S is the noise of the sensors, d what h leaves of the drive without the effect: another effect, and what the rim
-integral is short of the simulator.  E is by how much -2 log posterior would fall for an analyst who adds the very
+S is the noise of the sensors, d the residual of h for the drive without the effect: another effect, and the error of
+the rim integral against the simulator.  E is by how much -2 log posterior would fall for an analyst who adds the very
 formula of the generator.
 """
 
@@ -80,14 +80,9 @@ def shown(case: Case) -> Shown:
 def driven_without_noise(case: Case, parts: tuple[Hidden, ...]) -> Recording:
     """The drive with these parts, and sensors without noise or gain errors."""
     how = together(parts)
-    driven = simulate(how.tractor(_quiet(case.config)), how.way(case.scenario), case.seed, how.effects)
+    quiet = case.config.model_copy(update={"noise": case.config.noise.scaled(0.0)})
+    driven = simulate(how.tractor(quiet), how.way(case.scenario), case.seed, how.effects)
     return how.after(driven)
-
-
-def _quiet(config: Config) -> Config:
-    silent = {"absolute": 0.0, "relative": 0.0, "of_mean": 0.0, "gain": 0.0}
-    none = {q: getattr(config.noise, q).model_copy(update=silent) for q in type(config.noise).model_fields}
-    return config.model_copy(update={"noise": config.noise.model_copy(update=none)})
 
 
 class _Reading(NamedTuple):

@@ -45,12 +45,12 @@ class Fed(NamedTuple):
     remote: bool
 
 
-def frames_of(data: bytes, known: Sequence[Known], start: float = 1.7e9) -> Iterator[Fed]:
+def frames_of(data: bytes, known: Sequence[Known]) -> Iterator[Fed]:
     """The frames that `data` stands for; what is left of less than a record is dropped.
 
     A step that is no number is that of one frame only, as a wild stamp is.
     """
-    now = start
+    now = 1.7e9
     for i in range(0, len(data) - RECORD + 1, RECORD):
         kind, which, step, flags = data[i : i + 4]
         payload = data[i + 4 : i + RECORD]

@@ -28,6 +28,7 @@ from soilbus.daemon.service import Service
 from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, loaded, stored_gaussian
 from soilbus.estimation.assembly import effects_and_parameters_of, effects_of
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.grouping import grouped
 from soilbus.offline.replay import LogError, read_frames
 from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.pipeline import Pipeline
@@ -96,9 +97,8 @@ def drive() -> tuple[can.Message, ...]:
 @cache
 def known() -> tuple[Known, ...]:
     """Its last ROUNDS frames of each message, round after round: a whole turn of the counters."""
-    of: dict[int, list[Known]] = {}
-    for m in drive():
-        of.setdefault(m.arbitration_id, []).append(Known(m.arbitration_id, m.is_extended_id, bytes(m.data)))
+    heard = (Known(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in drive())
+    of = grouped(heard, lambda frame: frame.identifier)
     return tuple(k for turn in zip(*(frames[-ROUNDS:] for frames in of.values()), strict=True) for k in turn)
 
 
@@ -210,7 +210,7 @@ def check_service(data: bytes) -> int:
 
 
 class _Paced(ScriptedBus):
-    """Hands out messages every 5 ms, whatever their stamps say."""
+    """Hands out messages every 5 ms, not by their stamps."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         due = 1000.0 + 0.005 * self.next

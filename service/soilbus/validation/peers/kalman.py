@@ -3,10 +3,10 @@
 Li, Ding, Zheng, Yang, Zhao & Liu 2018 (Mech. Syst. Signal Process. 104:758).  Assumes: all
 other parameters fixed at nominal values; load, torque, slip and sinkage of each wheel and
 the drawbar pull are measured.  The paper's text was not at hand: robust and adaptive parts
-are those of Yang, He & Xu 2001 (J. Geodesy 75:109): wild innovations weigh less (Huber),
-and the predicted covariance grows where innovations are larger than it foresees.  The
-noise of sinkage and slip sensors is carried into that of the readings.  Error bars: the
-filter's covariance.
+are those of Yang, He & Xu 2001 (J. Geodesy 75:109): large innovations are down-weighted
+(Huber), and the predicted covariance is inflated where innovations exceed it.  The noise of
+sinkage and slip sensors is propagated into that of the readings.  Error bars: the filter's
+covariance.
 """
 
 from __future__ import annotations

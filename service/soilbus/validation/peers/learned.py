@@ -61,7 +61,7 @@ class Regressor:
         return {name: Estimate(float(np.exp(v)), np.nan) for name, v in zip(TARGETS, logs, strict=True)}
 
 
-def trained(windows: int, seed: int = SEED) -> Regressor:
+def trained(windows: int) -> Regressor:
     """Train on this number of windows.  ModuleNotFoundError, with a line for the user, without scikit-learn."""
     try:
         from sklearn.kernel_ridge import KernelRidge
@@ -70,7 +70,7 @@ def trained(windows: int, seed: int = SEED) -> Regressor:
         from sklearn.preprocessing import StandardScaler
     except ModuleNotFoundError:
         raise ModuleNotFoundError("the learned regressor needs the extra soilbus[peers]") from None
-    pairs = [training_case(np.random.default_rng([seed, i])) for i in range(windows)]
+    pairs = [training_case(np.random.default_rng([SEED, i])) for i in range(windows)]
     X = np.array([features(case.problem, case.assumed) for case in pairs])
     y = np.log([targets(case.soil) for case in pairs])
     machine = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))

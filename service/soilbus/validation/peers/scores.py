@@ -9,12 +9,12 @@ import numpy as np
 from scipy.stats import binomtest
 
 from soilbus.arrays import Array
+from soilbus.estimation.posterior import NORMAL_95
 from soilbus.terra.wheel import Soil
 from soilbus.validation.peers.windows import B_REF, Z_REF, Answer
 
 QUANTITIES = ("bearing", "phi", "n", "c", "K")
 HIGHEST = {"phi": np.pi / 2.0}
-Z_95 = 1.959964
 SIGNIFICANT = 0.05
 ALIKE = 0.02
 """Relative difference of RMS errors that counts as none."""
@@ -67,7 +67,7 @@ class Score:
         if np.isnan(std).all():
             return np.nan
         off = np.abs(np.log(value / truth(self.soil, quantity)))
-        return float(np.mean(off <= Z_95 * std / value + 1e-12))
+        return float(np.mean(off <= NORMAL_95 * std / value + 1e-12))
 
     @property
     def milliseconds(self) -> float:

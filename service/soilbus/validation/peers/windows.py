@@ -13,11 +13,11 @@ from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.observation_model import Linearisation, ObservationModel, diagonals
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.validation.windows import observed
 
 Answer = dict[str, Estimate]
 """Estimates by name: parameters of Soil, and "bearing"; std is nan where the method has none."""
@@ -87,21 +87,12 @@ def assumed_of(soil: Soil, rng: np.random.Generator) -> Soil:
 
 def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
     """10 s of the full simulator, slip swept between 0.05 and 0.4, bins of 0.1 s."""
-    quiet = [f"noise.{q}.{kind}=1e-9" for q in _NOISY for kind in _NOISY[q]] if noise_free else []
+    config = reference_configuration()
+    quiet = config.model_copy(update={"noise": config.noise.scaled(0.0)}) if noise_free else config
     scenario = Scenario(LENGTH, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
-    recording = simulate(reference_configuration(quiet), scenario, seed)
-    rig, estimator = reference_rig(), reference_configuration().estimator
-    store = Bins(rig, estimator.bin, 0.0)
-    store.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
-    problem = ObservationModel(store.window(0.0, LENGTH), rig, fit_model(), estimator.min_speed)
+    recording = simulate(quiet, scenario, seed)
+    problem = observed(config, recording.channels, LENGTH)
     return Case(soil, assumed_of(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
-
-
-_NOISY = {
-    "torque": ("of_mean", "gain"), "load": ("relative", "gain"), "speed": ("relative", "gain"),
-    "ground_speed": ("relative", "gain"), "draft": ("absolute", "gain"), "sinkage": ("absolute",),
-    "pitch": ("absolute",), "acceleration": ("absolute",),
-}  # fmt: skip
 
 
 def entry_angles(problem: ObservationModel) -> Array:

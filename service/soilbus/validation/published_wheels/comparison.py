@@ -1,9 +1,9 @@
 """`python -m soilbus.validation.published_wheels POINTS`: what the model misses on published single-wheel points.
 
 POINTS is shared/field/single-wheel-published.csv: five or six rows a wheel, traced
-by eye from figures.  So each line says what these few rows show under the errors assumed in
-rigs/*.toml, and no more.  Where the soil is from the other wheel, soil and effects are known
-beforehand as that wheel's fit left them: what is missing then is what differs between the two.
+by eye from figures.  So each line holds only for these few rows and the errors assumed in
+rigs/*.toml.  Where the soil is from the other wheel, that wheel's posterior of soil and effects is
+the prior: a missing effect is then a difference between the two wheels.
 """
 
 from __future__ import annotations

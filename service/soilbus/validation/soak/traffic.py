@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import count, islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 
@@ -55,20 +55,11 @@ def traffic(config: Config, seed: int) -> Iterator[can.Message]:
     """
     scenario = Scenario(LAP, (Patch(0.0, SOIL),), draft=Swing(1500.0, 5000.0))
     driven = _with_gains(drive(config, scenario, seed), config, seed)
-    for lap in _laps():
-        recording = Recording(driven.columns, measure(driven, _without_gains(config), _seed(seed, lap)), seed)
+    without_gains = config.model_copy(update={"noise": config.noise.scaled(0.0, "gain")})
+    for lap in count():
+        of_lap = int(np.random.SeedSequence([seed, lap]).generate_state(1)[0])
+        recording = Recording(driven.columns, measure(driven, without_gains, of_lap), seed)
         yield from frames(recording, config, start=START_TIME + lap * LAP)
-
-
-def _laps() -> Iterator[int]:
-    lap = 0
-    while True:
-        yield lap
-        lap += 1
-
-
-def _seed(seed: int, lap: int) -> int:
-    return int(np.random.SeedSequence([seed, lap]).generate_state(1)[0])
 
 
 def _with_gains(driven: Drive, config: Config, seed: int) -> Drive:
@@ -79,9 +70,3 @@ def _with_gains(driven: Drive, config: Config, seed: int) -> Drive:
             name = f"{quantity}.{wheel}" if wheel else quantity
             columns[name] = columns[name] * (1.0 + noise.gain * channel_rng(seed, f"gain of {name}").standard_normal())
     return replace(driven, columns=columns)
-
-
-def _without_gains(config: Config) -> Config:
-    noise = {name: getattr(config.noise, name) for name in type(config.noise).model_fields}
-    still = {name: of.model_copy(update={"gain": 0.0}) for name, of in noise.items()}
-    return config.model_copy(update={"noise": config.noise.model_copy(update=still)})

@@ -1,4 +1,4 @@
-"""What a soak run must have shown."""
+"""Conditions that a soak run must meet."""
 
 from __future__ import annotations
 

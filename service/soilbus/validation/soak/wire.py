@@ -1,6 +1,6 @@
 """A bus on which things go wrong: frames lost, spoilt, doubled, late; strangers; outages; clock steps.
 
-It counts: every frame that it hands over is one that the service must account for.
+It counts the frames that it delivers: the service must account for each of them.
 """
 
 from __future__ import annotations

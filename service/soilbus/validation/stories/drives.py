@@ -9,6 +9,7 @@ import numpy as np
 
 from soilbus.config.model import Config
 from soilbus.estimation.tracker import TrackerOutput
+from soilbus.grouping import grouped
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
@@ -67,9 +68,7 @@ def _largest_drafts(machine: str) -> dict[str, float]:
 
 def at_ten_hertz(config: Config, scenario: Scenario, seed: int) -> Moment:
     """A frame of each message for every cycle of a drive."""
-    found: Moment = {}
-    for message in frames(simulate(config, scenario, seed), config):
-        found.setdefault(message.arbitration_id, []).append(message)
+    found = grouped(frames(simulate(config, scenario, seed), config), lambda message: message.arbitration_id)
     cycles = START_TIME + CYCLE * (1.0 + np.arange(int(SECONDS / CYCLE) - 2))
     chosen = {}
     for i, messages in found.items():

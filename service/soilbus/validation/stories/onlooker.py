@@ -1,8 +1,7 @@
-"""A service on a spoilt wire, and an onlooker who judges each verdict by what he knows of the wire's deliveries.
+"""A service on a faulty bus, and an onlooker who knows each fault and judges each decision of the service by it.
 
-The wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as asked.  The soil comes
-from a tracker that says of each window what is true of the ground at its end: GO then hangs on
-what the wire delivers alone, as often as the service lets it.
+The bus repeats the last moments of a good drive at 10 Hz, with the faults of a story.  The tracker returns the true
+soil at the end of each window, so whether the decision is GO depends on the delivered frames alone.
 """
 
 from __future__ import annotations
@@ -35,6 +34,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.tracker import Tracker, TrackerOutput
 from soilbus.estimation.window import Window
+from soilbus.grouping import grouped
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
@@ -100,11 +100,9 @@ def needed_messages(config: Config, quantities: Sequence[str] = NEEDED) -> tuple
     return tuple(dict.fromkeys(signal.partition(".")[0] for signal in mapped))
 
 
-def good_moment(config: Config = CONFIG, seed: int = 3) -> Moment:
+def good_moment(config: Config = CONFIG) -> Moment:
     """The last frames of each message in a good drive."""
-    found: Moment = {}
-    for message in drive_messages(config, 10.0, seed):
-        found.setdefault(message.arbitration_id, []).append(message)
+    found = grouped(drive_messages(config, 10.0), lambda message: message.arbitration_id)
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
@@ -137,13 +135,13 @@ def fit_of(tracked: TrackerOutput) -> Fit:
     return tracked.fit
 
 
-def good_tracked(config: Config = CONFIG, seed: int = 3) -> TrackerOutput:
+def good_tracked(config: Config = CONFIG) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
     limits = {"max_bearing_std": config.estimator.max_bearing_std}
     config = config.model_copy(update={"estimator": reference_configuration().estimator.model_copy(update=limits)})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
-    messages = drive_messages(config, 20.0, seed)
+    messages = drive_messages(config, 20.0)
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)

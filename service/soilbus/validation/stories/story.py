@@ -23,7 +23,7 @@ __all__ = [
 LAST = 0.4
 """Seconds of good frames at the end of a story."""
 HEAL = 7.0
-"""Seconds of good frames, beside a window's length, after which go is due again, whatever has happened."""
+"""Seconds of good frames, beside a window's length, after which go is due again after any fault."""
 STEPS = (-3600.0, -5.0, -1.5, -0.6, 0.4, 2.0, 70.0, 3600.0)
 """Seconds by which the clock that stamps frames is set."""
 TO_SOME = ("deaf", "noisy", "spoilt", "repeated")
