@@ -61,8 +61,8 @@ MUTATIONS = (
         (f"{STORIES}::test_what_the_worker_says_of_the_time_before_the_clock_was_set_is_not_taken",),
     ),
     Mutation(
-        "stale inputs do not interrupt", "daemon/service.py",
-        "if stale := self.intake.stale(present, self._inputs_since):", "if False:",
+        "stale inputs do not interrupt", "pipeline/intake.py",
+        "if not now - self.last_seen.get(c.name, since) <= (c.timeout or DEFAULT_TIMEOUT)", "if False",
         ("tests/daemon/test_loop.py::test_losing_a_needed_stream_ends_go_within_its_timeout",),
     ),
     Mutation(

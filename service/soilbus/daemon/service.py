@@ -347,15 +347,16 @@ class Service:
             return ServiceState.WAITING, f"bus_error {self.bus.state}"
         if self._is_silent(now):
             return ServiceState.LISTENING, "no_frames"
-        present, read = self._time.at(now), self._time.read_until(now)
-        if stale := self.intake.stale(present, self._inputs_since):
-            if not self.intake.stale(read, self._inputs_since):
-                return ServiceState.DEGRADED, f"overload frames are taken {present - read:.1f} s late"
-            return ServiceState.DEGRADED, self._why_stale(stale, now)
+        read = self._time.read_until(now)
+        if stale := self.intake.stale(read, self._inputs_since):
+            return ServiceState.DEGRADED, self._why_stale(stale, read)
         if self._fault or self._guarded_estimator.in_fault:
             return ServiceState.FAULT, self._fault or INTERNAL
         if now - self.bus.last_foreign < FOREIGN_SENDER_HOLD_TIME:
             return ServiceState.DEGRADED, "foreign_sender"
+        present = self._time.at(now)
+        if self.intake.stale(present, self._inputs_since):
+            return ServiceState.DEGRADED, f"overload frames are taken {present - read:.1f} s late"
         return None
 
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
@@ -373,9 +374,9 @@ class Service:
             reason = f"bus_error {self.bus.state}"
         return state_after(self.result), reason
 
-    def _why_stale(self, stale: list[str], now: float) -> str:
-        """Reason for channels without an accepted sample: silent since the start, silent now, or all refused."""
-        refused = self.intake.refused(self._time.at(now))
+    def _why_stale(self, stale: list[str], read: float) -> str:
+        """Reason for channels that are stale at the bus time `read`: silent from the start, silent now, or refused."""
+        refused = self.intake.refused(read)
         silent = [name for name in stale if name not in refused]
         if never := [name for name in silent if name not in self.intake.last_seen]:
             return "input_missing " + " ".join(never)
