@@ -51,18 +51,23 @@ MUTATIONS = (
         (f"{STORIES}::test_go_ends_with_the_age_by_our_own_clock_where_the_stamps_stand",),
     ),
     Mutation(
+        "frames that wait in the kernel are as fresh as if they had just come", "daemon/bus_time.py",
+        "max(self._stamp, now + self._offset)", "self._stamp + max(0.0, now - self.last_frame)",
+        ("tests/daemon/test_loop.py::test_a_loop_that_falls_behind_says_so_and_nothing_it_reads_is_fresh",),
+    ),
+    Mutation(
         "a late result of the old epoch is taken", "daemon/service.py",
         "if pending.epoch == self.intake.epoch:", "if True:",
         (f"{STORIES}::test_what_the_worker_says_of_the_time_before_the_clock_was_set_is_not_taken",),
     ),
     Mutation(
         "stale inputs do not interrupt", "daemon/service.py",
-        '"input_missing", "input_stale", ', "",
+        "if stale := self.intake.stale(present, self._inputs_since):", "if False:",
         ("tests/daemon/test_loop.py::test_losing_a_needed_stream_ends_go_within_its_timeout",),
     ),
     Mutation(
         "another sender does not interrupt", "daemon/service.py",
-        ', "foreign_sender"))', "))",
+        "if now - self.bus.last_foreign < FOREIGN_SENDER_HOLD_TIME:", "if False:",
         ("tests/daemon/test_loop.py::test_a_second_sender_ends_go",),
     ),
     Mutation(

@@ -29,7 +29,7 @@ def follow(bus: can.BusABC) -> None:
     draft, wanted, limit, advised, counter = LEAST_DRAFT, OWN_SLIP, NO_LIMIT, -1e9, 0
     for frame in bus:
         name, now = NAMES.get(frame.arbitration_id), frame.timestamp
-        if name is None or crc(frame.arbitration_id, frame.data) != frame.data[7]:
+        if name is None or len(frame.data) != 8 or crc(frame.arbitration_id, frame.data) != frame.data[7]:
             continue
         values = OURS.decode_message(frame.arbitration_id, frame.data)
         is_valid = values.get("Status") == "valid"

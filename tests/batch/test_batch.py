@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import queue
 import shutil
 from pathlib import Path
 
@@ -14,12 +15,12 @@ import soilbus
 from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
-from soilbus.offline.batch import BatchError, jobs_of, run_batch
+from soilbus.offline.batch import BatchError, jobs_of, run_batch, workers_watched
 from soilbus.offline.parts import Outcome
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.report.batch import batch_text
+from soilbus.report.batch import batch_text, fleet_text
 
 pd = pytest.importorskip("pandas")
 SHORT = "estimator.window=4"
@@ -244,6 +245,29 @@ def test_a_vehicle_whose_diagnosis_failed_is_diagnosed_again_on_request(client, 
     assert ["1 of 1 vehicles diagnosed" in lines for lines in said.values()] == [False, True]
 
 
+def test_a_diagnosis_of_an_earlier_run_does_not_stay_beside_other_logs(client, config, logs, moved, tmp_path):
+    (tmp_path / "logs/red").mkdir(parents=True)
+    (tmp_path / "logs/red/a.log").write_text(moved(0.0))
+    out, command = tmp_path / "out", [str(tmp_path / "logs")]
+    run_batch(client, jobs_of(config, "t", command, lambda _: config), out, diagnose=True)
+    assert (out / "diagnosis.json").is_file()
+    (tmp_path / "logs/red/b.log").write_text(moved(60.0))
+    batch = run_batch(client, jobs_of(config, "t", command, lambda _: config), out)
+    assert not (out / "diagnosis.json").exists()
+    assert not (out / "effects.parquet").exists()
+    assert "of an earlier run are removed; --diagnose writes them anew" in batch_text(batch, out)
+    again = run_batch(client, jobs_of(config, "t", command, lambda _: config), out)
+    assert "of an earlier run" not in batch_text(again, out)
+
+
+def test_a_parameter_at_the_edge_of_its_range_has_no_deviation_of_zero():
+    sizes = {"softening": {"value": 0.4, "std": 0.03}, "dug": {"value": 0.0, "std": 0.0}}
+    effect = {"name": "slip_sinkage", "parameters": sizes, "named": True, "onset": None}
+    vehicle = {"vehicle": "T1", "effects": [effect], "logs": ["a.log"], "fault": None}
+    text = fleet_text({"vehicles_diagnosed": 1, "vehicles": [vehicle], "false_discovery_rate": 0.1, "types": []})
+    assert "T1: slip_sinkage (softening 0.4 ± 0.03, dug 0 (at the edge of its range))" in text
+
+
 def test_a_manifest_names_vehicle_start_and_configuration(client, config, logs, drive, tmp_path):
     since_begin = "".join(f"({float(line[1:18]) - 1.7e9 + 5.0:.6f}){line.split(')', 1)[1]}" for line in drive)
     (tmp_path / "a.log").write_text(since_begin)
@@ -307,6 +331,16 @@ def test_a_lost_scheduler_is_one_line_and_leaves_what_is_done(in_process, config
         with pytest.raises(BatchError, match="scheduler is lost; --resume"):
             run_batch(client, own, tmp_path / "out", lose)
     assert len(list((tmp_path / "out/parts").iterdir())) >= 1
+
+
+def test_a_scheduler_without_workers_is_said_once_and_so_is_their_return(in_process):
+    heard = queue.Queue()
+    with in_process() as (local, client), workers_watched(client, heard.put, every=0.05):
+        local.scale(0)
+        assert heard.get(timeout=30) is False
+        local.scale(1)
+        assert heard.get(timeout=30) is True
+    assert heard.empty()
 
 
 @pytest.mark.parametrize(

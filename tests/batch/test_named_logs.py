@@ -140,6 +140,33 @@ def test_a_log_in_an_archive_is_that_log(client, config, moved, named):
     assert (batch.windows, batch.errors) == (5, [])
 
 
+@pytest.mark.parametrize("written", ["to_csv", "to_parquet"])
+def test_a_manifest_by_url_names_logs_from_its_own_folder(written, config, named, tmp_path):
+    table = pd.DataFrame({"log": ["T7/b.log", "file:///elsewhere/c.log"], "vehicle": ["V 1", "V 2"], "start": [60, 70]})
+    name = f"m.{written.removeprefix('to_')}"
+    getattr(table, written)(name, index=False)
+    found = jobs_of(config, "t", [f"file://{tmp_path}/{name}"], lambda _: config)
+    assert [(job.vehicle, job.log, job.start) for job in found] == [
+        ("V 1", f"file://{tmp_path}/T7/b.log", 60.0),
+        ("V 2", "file:///elsewhere/c.log", 70.0),
+    ]
+
+
+def test_a_configuration_in_a_manifest_by_url_must_be_one_that_is_here(config, named, tmp_path):
+    Path("m.csv").write_text("log,configuration\na.log,mine.toml\n")
+    with pytest.raises(
+        BatchError, match=r"row 2: configuration mine\.toml: .* reference machine's name or an absolute"
+    ):
+        jobs_of(config, "t", [f"file://{tmp_path}/m.csv"], lambda _: config)
+
+
+def test_a_table_by_url_that_is_not_there_or_no_manifest_is_a_log(config, named, tmp_path):
+    Path("can.csv").write_text("timestamp,arbitration_id,extended,remote,error,dlc,data\n")
+    for name in ("none.csv", "can.csv"):
+        (job,) = jobs_of(config, "t", [f"file://{tmp_path}/{name}"], lambda _: config)
+        assert job.log == f"file://{tmp_path}/{name}"
+
+
 def test_a_query_is_no_part_of_a_logs_name(config):
     url = "https://store.example/T7/a.log.gz?token=a/b*"
     (job,) = jobs_of(config, "t", [url], lambda _: config)

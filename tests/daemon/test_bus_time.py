@@ -78,3 +78,31 @@ def test_nobody_sleeps_past_an_end_that_the_bus_can_tell(of_bus, bus):
     bus.present = END + 3600.0
     assert of_bus.wait(END, NOW + 0.49, 0.02) == 0.0
     assert of_bus.wait(math.inf, NOW + 0.49, 0.02) == 0.02
+
+
+def test_frames_that_waited_are_known_to_be_old_until_none_waits(bus):
+    time = BusTime(bus, NOW)
+    for i in range(100):  # one comes each 10 ms, one is taken each 30 ms
+        time.took(STAMP + 0.01 * i, NOW + 0.03 * i)
+    assert time.at(NOW + 3.0) == pytest.approx(STAMP + 3.0)
+    assert time.read_until(NOW + 3.0) == pytest.approx(STAMP + 0.99)
+    for i in range(100, 300):
+        time.took(STAMP + 0.01 * i, NOW + 3.0)
+    time.took_nothing(NOW + 3.0)
+    assert time.read_until(NOW + 3.2) == time.at(NOW + 3.2) == pytest.approx(STAMP + 3.2)
+
+
+@pytest.mark.parametrize("step", [-3600.0, -2.0, 0.7, 3600.0])
+def test_a_clock_that_was_set_is_followed_with_the_next_frame(of_bus, step):
+    of_bus.took(STAMP + 0.31 + step, NOW + 0.31)
+    assert of_bus.at(NOW + 0.5) == pytest.approx(STAMP + 0.5 + step, abs=0.011)
+
+
+def test_a_clock_that_runs_otherwise_than_ours_is_followed(bus):
+    time = BusTime(bus, NOW)
+    for rate in (1.001, 0.999):
+        for i in range(20_000):
+            time.took(STAMP + rate * 0.01 * i, NOW + 0.01 * i)
+            time.took_nothing(NOW + 0.01 * i + 0.005)
+        assert time.at(NOW + 200.0) == pytest.approx(STAMP + rate * 200.0, abs=0.01)
+        time = BusTime(bus, NOW)

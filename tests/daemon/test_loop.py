@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import itertools
 import math
+from collections import Counter
 from copy import copy
 from dataclasses import replace
+from typing import ClassVar
 
 import can
 import pytest
@@ -14,6 +16,7 @@ import pytest
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.can.wire import MessageWire
+from soilbus.daemon.notify import Notifier
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.simulator.reference import reference_configuration
 from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, ScriptedBus, drive_messages
@@ -498,3 +501,101 @@ def test_a_frame_that_is_not_for_us_says_nothing_of_those_behind_it(recording):
         samples.append([result.samples for result in bench.results])
     assert samples[0] == samples[1]
     assert samples[0][0] > 1000
+
+
+class SlowBus(ScriptedBus):
+    """A bus of which each frame takes `cost` [s] to take."""
+
+    cost = 0.0
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        message = super().recv(timeout)
+        self.clock.now += self.cost if message is not None else 0.0
+        return message
+
+
+def test_a_loop_that_falls_behind_says_so_and_nothing_it_reads_is_fresh(recording):
+    """Half of the frames that come can be taken: what is read is ever older, and the frames still go out in time."""
+    bench = Bench(recording)
+    bench.wire = wire = SlowBus(bench.clock, recording)
+    bench.run(DURATION - 5.0)
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+    wire.cost = 2.0 * DURATION / len(recording)
+    began = bench.run(6.0)
+    fell_behind = [f for f in bench.sent("Traversability", since=began) if f["at"] > began + 3.5]
+    late = wire.clock.now + wire.offset - wire.messages[wire.next].timestamp
+    assert late > 2.0
+    assert fell_behind
+    assert {str(f["State"]) for f in fell_behind} == {"unknown"}
+    last = bench.sent("SoilbusStatus")[-1]
+    assert (str(last["State"]), str(last["Reason"])) == ("degraded", "overload")
+    assert fell_behind[-1]["Age"] == "not_available" or fell_behind[-1]["Age"] > late
+    assert {str(f["Status"]) for f in bench.sent("TractionAdvice", since=began + 3.5)} <= {"degraded", "not_available"}
+    wire.cost = 0.0
+    bench.run(0.5)
+    bench.service.step()
+    assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) != "no_frames"
+
+
+class Told(Notifier):
+    """What systemd hears."""
+
+    texts: ClassVar[list[str]] = []
+
+    def status(self, text: str) -> None:
+        self.texts.append(text)
+
+
+def test_inputs_whose_samples_are_all_refused_are_called_so_and_not_silent(recording):
+    loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    cut = [copy(message) for message in recording]
+    for message in cut:
+        if message.arbitration_id == loads and message.timestamp > recording[0].timestamp + 5.0:
+            message.data = message.data[:7]
+    bench = Bench(cut)
+    bench.service.notifier = told = Told()
+    bench.run(4.9)
+    assert bench.sent("SoilbusStatus")[-1]["RejectedShare"] == 0.0
+    bench.run(5.0)
+    last = bench.sent("SoilbusStatus")[-1]
+    assert (str(last["State"]), str(last["Reason"])) == ("degraded", "input_rejected")
+    assert "input_rejected load.FL (wrong_length) load.FR (wrong_length)" in told.texts[-1]
+    signals = Counter(channel.message for channel in bench.service.intake.channels)
+    names = {m.frame_id: m.name for m in load_databases(bench.config).messages}
+    second = [names[m.arbitration_id] for m in recording if 8.0 < m.timestamp - recording[0].timestamp < 9.0]
+    of_loads, of_all = 4 * second.count("WheelLoads"), sum(signals[name] for name in second)
+    assert last["RejectedShare"] == pytest.approx(100.0 * of_loads / of_all, abs=1.5)  # not of all since the start
+
+
+@pytest.mark.parametrize("step", [0.0, -3600.0])
+def test_an_input_that_has_had_no_time_to_come_is_not_called_missing(recording, step):
+    """Frames begin, or the clock is set, a moment before a status is due, and the loads come last."""
+    loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    begin, changes = recording[0].timestamp, recording[0].timestamp + (0.0 if step == 0.0 else 3.0)
+    messages = [copy(m) for m in recording if m.arbitration_id != loads or not 0.0 <= m.timestamp - changes < 0.3]
+    bench = Bench(messages)
+    bench.wire.offset -= 0.9
+    bench.run(0.9 + changes - begin)
+    for message in messages:
+        message.timestamp += step
+    bench.wire.offset += step
+    since = bench.run(3.0)
+    assert {str(f["Reason"]) for f in bench.sent("SoilbusStatus", since)} == {"none"}
+    bench.wire.messages = [m for m in messages if m.arbitration_id != loads]
+    bench.wire.next = len([m for m in bench.wire.messages if m.timestamp < bench.clock.now + bench.wire.offset])
+    bench.run(2.5)
+    assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) == "input_stale"
+
+
+def test_after_a_pause_of_an_input_its_windows_say_why_they_are_not_valid(recording):
+    """A window with a hole in it is no reason that inputs fail now."""
+    loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    begin = recording[0].timestamp
+    bench = Bench([m for m in recording if m.arbitration_id != loads or not 11.0 < m.timestamp - begin < 12.5])
+    bench.run(DURATION - 0.5)
+    assert bench.results[-1].reason.startswith("input_stale load.FL")
+    again = [f for f in bench.sent("SoilbusStatus") if f["at"] + bench.wire.offset > begin + 13.5]
+    assert len(again) >= 2
+    assert {(str(f["State"]), str(f["Reason"])) for f in again} == {("degraded", "input_stale")}
+    of_loop = {str(f["State"]) for f in bench.sent("Traversability", since=again[0]["at"])}
+    assert of_loop == {str(bench.results[-1].traversability.state)} == {"caution"}

@@ -1,8 +1,12 @@
 """notify.py against a real datagram socket, as systemd's is."""
 
+import json
 import logging
 import os
+import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -83,3 +87,45 @@ def test_failure_is_logged_and_not_fatal(address: str, caplog: pytest.LogCapture
 )
 def test_watchdog_interval_is_half_of_what_systemd_asks(environ: dict[str, str], interval: float | None) -> None:
     assert Notifier.from_environment(environ).watchdog_interval == interval
+
+
+def test_a_socket_that_is_gone_is_one_warning_until_it_is_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    name = str(tmp_path / "notify")
+    notifier = Notifier(name)
+    for _ in range(2):
+        for _ in range(5):
+            notifier.status("valid")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+            receiver.bind(name)
+            notifier.status("valid")
+        Path(name).unlink()
+    assert [record.getMessage() for record in caplog.records] == [
+        "systemd not notified of STATUS=valid: No such file or directory"
+    ] * 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_in_good_order_and_a_hang_up_does_too(tmp_path: Path, number: signal.Signals) -> None:
+    """A terminal that is closed, or kill -HUP, is no reason to lose the state."""
+    state = tmp_path / "state.json"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(tmp_path / "notify"))
+        receiver.settimeout(60.0)
+        bus = ["--set", "bus.interface=virtual", "--set", "bus.channel=of_signals"]
+        service = subprocess.Popen(
+            [sys.executable, "-m", "soilbus", "run", "--config", "tractor", *bus],
+            env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "STATE_DIRECTORY": str(tmp_path)},
+        )
+        try:
+            while not state.exists():  # one at the start
+                receiver.recv(4096)
+            state.unlink()
+            service.send_signal(number)
+            while b"STOPPING=1" not in receiver.recv(4096):
+                pass
+            assert service.wait(30.0) == 0
+        finally:
+            service.kill()
+    assert json.loads(state.read_text())["state"]["starts"] == 1

@@ -13,8 +13,10 @@ from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import scores
+from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict, required_fall
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
+from soilbus.estimation.solver import Termination
 from soilbus.report.statement import pressure_error
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -107,6 +109,14 @@ def shown_by(record: Record) -> tuple[Detectable, ...]:
     return detectable([record], PRIOR, base, candidates)
 
 
+def test_where_no_effect_is_left_none_could_be_shown():
+    """A catalogue of one effect, which the model of the type has already."""
+    record = driven(dataclasses.replace(RICH, duration=20.0), 3)
+    base = fit_model([record], PRIOR, ())
+    assert base is not None
+    assert detectable([record], PRIOR, base, []) == ()
+
+
 def test_an_effect_that_no_datum_depends_on_has_no_evidence_either_way():
     """Without a draft its load cell has neither an offset nor a gain: the evidence stays exactly as it is."""
     record = driven(dataclasses.replace(RICH, duration=20.0), 3, without="draft")
@@ -126,3 +136,27 @@ def test_three_faults_that_have_nothing_in_common_are_not_doubted():
     reported = diagnose([record], PRIOR, list(CATALOGUE.values()))
     assert {a.effect.name for a in reported.additions} == {"torque_lag", "draft_gain", "rate_stiffening"}
     assert reported.imitation == ()
+
+
+def test_effects_whose_fit_did_not_converge_and_predicts_worse_are_not_reported(monkeypatch):
+    """As on a rover whose present model does not converge either: gap 2.5 -> 575 657 with an effect."""
+    record = driven(dataclasses.replace(RICH, duration=20.0), 3)
+
+    class Diverging:
+        excess = 0.0
+
+        def __init__(self, full, thinned, base, candidates, options):
+            effect = CATALOGUE["drivetrain_loss"]
+            fits = tuple(dataclasses.replace(fit, termination=Termination.LIMIT) for fit in base.fits)
+            checks = tuple(dataclasses.replace(check, chi2=1e6 * check.rows) for check in base.checks)
+            worse = dataclasses.replace(base, effects=(effect,), fits=fits, checks=checks)
+            self.found = [Addition(effect, 1.0, {}, {effect.name: 1e5})], worse
+
+        def steps(self):
+            yield self.found
+
+    monkeypatch.setattr("soilbus.diagnosis.diagnose.Search", Diverging)
+    reported = diagnose([record], PRIOR, [CATALOGUE["drivetrain_loss"]])
+    assert reported.additions == ()
+    assert reported.completed is reported.base
+    assert reported.gap_after.value < 2.0

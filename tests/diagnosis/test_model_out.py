@@ -109,6 +109,14 @@ def test_dbc_files_are_found_from_the_new_place(tmp_path):
     assert tomllib.loads(with_effects_text(config, [], [], here))["dbc"]["input"] == ["dbc/own.dbc", "iso11783.dbc"]
 
 
+def test_our_own_dbc_is_found_beside_another_file_of_its_name(tmp_path):
+    (tmp_path / "soilbus.dbc").write_text("another file of the same name")
+    text = TRACTOR.read_text()
+    assert "[output]" not in text
+    made = tomllib.loads(with_effects_text(TRACTOR, [], [], tmp_path))
+    assert located(tmp_path, made["output"]["dbc"]).resolve() == shipped_dbc("soilbus.dbc").resolve()
+
+
 def test_a_configuration_that_cannot_be_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="unknown key"):
         with_effects_text(TRACTOR, ["modell.effects=[]"], [], tmp_path)

@@ -27,7 +27,8 @@ from soilbus.terra.soils import soil_named
 CONFIG = reference_configuration()
 PLACE = Disagreement("draft", "", "slip 0.20..0.35", 312.0, 1e-5)
 SOIL = Posterior(soil_named("loam"), np.diag([0.3, 0.02, 0.01, 0.005, 0.1, 0.02]) ** 2)
-NOTHING = SimpleNamespace(fits=[SimpleNamespace(posterior=SOIL)])
+NOTHING = SimpleNamespace(fits=[SimpleNamespace(posterior=SOIL)], converged=True)
+OPEN_END = SimpleNamespace(fits=NOTHING.fits, converged=False)
 NAMES = sorted(CATALOGUE)
 
 
@@ -112,7 +113,7 @@ def test_effects_that_are_more_together_than_apart_are_doubted_with_what_rules_t
     assert "tyre_deflection: a rigid wheel has no tyre" in reported
     assert "rolling_radius: a rigid wheel" in reported
     assert verdict_of(9.0, 1.0, 900, [0.9] * 3) is Verdict.NAMED
-    assert verdict_of(9.0, 1.0, 900, [0.9] * 3, imitation=True) is Verdict.AMBIGUOUS
+    assert verdict_of(9.0, 1.0, 900, [0.9] * 3, is_doubtful=True) is Verdict.AMBIGUOUS
     assert doubt(dataclasses.replace(found, imitation=())) is None
 
 
@@ -136,3 +137,13 @@ def test_what_could_not_be_shown_is_reported_with_what_it_does_to_the_soil():
     assert f"its +- {100.0 * std.std / std.value:.1f} %: slip_sinkage 1 by -20.0 %" in text
     assert "torque_lag" not in text.splitlines()[-1]
     assert "multipass" not in text.splitlines()[-1]
+
+
+def test_names_from_fits_that_did_not_converge_are_no_finding():
+    added = (addition("bulldozing", 1.0),)
+    gaps = Gap(2.6, 900), Gap(0.9, 900)
+    before = Diagnosis(Verdict.AMBIGUOUS, (PLACE,), added, OPEN_END, NOTHING, (), *gaps)
+    both = Diagnosis(Verdict.AMBIGUOUS, (PLACE,), added, OPEN_END, OPEN_END, (), *gaps)
+    assert "the fit of the present model did not converge" in (doubt(before) or "")
+    assert "present model and that of the model with the effects did not converge" in (doubt(both) or "")
+    assert doubt(Diagnosis(Verdict.NAMED, (PLACE,), added, NOTHING, NOTHING, (), *gaps)) is None

@@ -213,6 +213,25 @@ def test_a_signal_of_two_wheels_says_less_than_two_sensors(tmp_path):
     assert said[1] > said[0]
 
 
+def test_a_lock_that_falls_silent_is_neither_open_nor_locked(tmp_path):
+    """Locked wheels share a torque anyhow, open ones turn anyhow: of a silent lock neither is known."""
+    text = rear_driven().replace("[vehicle]", '[vehicle]\ndifferential_lock = "McuRL.State"')
+    rig, unmapped = (rig_of(configured(tmp_path, each)) for each in (text, rear_driven()))
+    window = window_of(configured(tmp_path, text), rig)
+    values = {"open": 0.0, "locked": 1.0, "silent": np.nan}
+    lock = {state: np.full(len(window.t), value) for state, value in values.items()}
+    seen = {state: completed(replace(window, differential_lock=lock[state]), rig).observations for state in values}
+    seen["unmapped"] = completed(window, unmapped).observations
+    sharing, turning = (
+        {state: float(getattr(each, variance)[:, place].mean()) for state, each in seen.items()}
+        for variance, place in (("torque_var", 3), ("variance", 7))
+    )
+    assert np.isfinite(sharing["open"])
+    assert sharing["unmapped"] == sharing["open"]
+    assert np.isnan([sharing["locked"], sharing["silent"]]).all()
+    assert turning["silent"] == turning["open"] == turning["unmapped"] > turning["locked"]
+
+
 def test_specific_force_holds_the_slope_whatever_the_pitch_sensor_says(tmp_path):
     text = PLAIN.replace(
         'acceleration = "Attitude.LongAccel"',

@@ -151,6 +151,78 @@ def test_a_shaft_without_a_torque_still_asks_for_its_gear(tmp_path, capsys):
         assert [wheel["torque"], wheel["gear_ratio"]] == ["?", "?"]
 
 
+VORN = [
+    (385, "ASM_VL_01", {"ASM_VL_Mom_Ist": "Nm", "ASM_VL_Mom_Soll": "Nm", "ASM_VL_Drehz": "1/min"}),
+    (386, "ASM_VR_01", {"ASM_VR_Mom_Ist": "Nm", "ASM_VR_Mom_Soll": "Nm", "ASM_VR_Drehz": "1/min"}),
+    (432, "Radlast", {"Radlast_HL": "kN", "Radlast_HR": "kN"}),
+    (448, "Fahrdyn", {"Laengsbeschl": "m/s^2", "Nickwinkel": "deg", "Zugkraft": "daN", "Radar_Geschw": "km/h"}),
+]
+LETTERS = [
+    (529, "MCU_F_Tq", {"MCU_F_TqEst": "Nm", "MCU_F_TqReq": "Nm", "MCU_F_TqMaxAvl": "Nm"}),
+    (530, "MCU_R_Tq", {"MCU_R_TqEst": "Nm", "MCU_R_TqReq": "Nm", "MCU_R_TqMaxAvl": "Nm"}),
+    (656, "Scale", {"FrontKg": "kg", "RearKg": "kg"}),
+]
+UNNAMED = [
+    (769, "LDC", {"LDC1": "daN", "LDC2": "daN"}),
+    (770, "EBC2", {"FrontAxleSpeed": "km/h", "RelSpdFrtAxlLftWhl": "km/h"}),
+    (771, "EMC1", {"MtrActTrqPct": "%", "MtrSpd": "rpm"}),
+]
+
+
+def a_dbc(path: Path, messages: list[tuple[int, str, dict[str, str]]]) -> Path:
+    """A file with signals of 16 bits, by message and unit."""
+    lines = ['VERSION ""', "BU_: A"]
+    for number, name, signals in messages:
+        lines.append(f"BO_ {number} {name}: 8 A")
+        lines += [
+            f' SG_ {signal} : {16 * i}|16@1- (0.01,0) [-300|300] "{unit}" A'
+            for i, (signal, unit) in enumerate(signals.items())
+        ]
+        lines.append("")
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_names_in_german_are_found(tmp_path, capsys):
+    found = mapped(proposed(capsys, a_dbc(tmp_path / "vorn.dbc", VORN)))
+    assert found == {
+        "wheel.FL.torque": "ASM_VL_01.ASM_VL_Mom_Ist", "wheel.FR.torque": "ASM_VR_01.ASM_VR_Mom_Ist",
+        "wheel.FL.speed": "ASM_VL_01.ASM_VL_Drehz", "wheel.FR.speed": "ASM_VR_01.ASM_VR_Drehz",
+        "wheel.RL.load": "Radlast.Radlast_HL", "wheel.RR.load": "Radlast.Radlast_HR",
+        "signals.acceleration": "Fahrdyn.Laengsbeschl", "signals.pitch": "Fahrdyn.Nickwinkel",
+        "signals.draft": "Fahrdyn.Zugkraft", "signals.ground_speed": "Fahrdyn.Radar_Geschw",
+    }  # fmt: skip
+
+
+def test_a_letter_names_an_axle_where_the_other_axle_has_the_same_name(tmp_path, capsys):
+    both = mapped(proposed(capsys, a_dbc(tmp_path / "letters.dbc", LETTERS)))
+    assert both == {
+        "axle.front.torque": "MCU_F_Tq.MCU_F_TqEst", "axle.rear.torque": "MCU_R_Tq.MCU_R_TqEst",
+        "axle.front.torque_limit": "MCU_F_Tq.MCU_F_TqMaxAvl", "axle.rear.torque_limit": "MCU_R_Tq.MCU_R_TqMaxAvl",
+        "axle.front.load": "Scale.FrontKg", "axle.rear.load": "Scale.RearKg",
+    }  # fmt: skip
+    alone = mapped(proposed(capsys, a_dbc(tmp_path / "one.dbc", LETTERS[1:2])))
+    assert alone["axle.?.torque"] == "MCU_R_Tq.MCU_R_TqEst"  # R may be the right one, or a revision
+
+
+def test_what_only_a_unit_fits_is_listed_and_a_difference_of_speeds_is_no_speed(tmp_path, capsys):
+    assert main(["init", "--dbc", str(a_dbc(tmp_path / "unnamed.dbc", UNNAMED))]) == 0
+    text = capsys.readouterr().out
+    assert "#   force: LDC.LDC1 (daN), LDC.LDC2 (daN)" in text
+    assert "#   speed: EBC2.RelSpdFrtAxlLftWhl (km/h, relative to another)" in text
+    assert not any("RelSpd" in signal for signal in mapped(tomllib.loads(text)).values())
+
+
+def test_one_open_torque_of_no_wheel_is_that_of_an_axle(tmp_path, capsys):
+    assert main(["init", "--dbc", str(a_dbc(tmp_path / "unnamed.dbc", UNNAMED))]) == 0
+    text = capsys.readouterr().out
+    found = tomllib.loads(text)
+    (axle,) = found["axle"]
+    assert [axle["name"], axle["torque"], axle["motor_speed"]] == ["?", "?", "EMC1.MtrSpd"]
+    assert "# EMC1.MtrActTrqPct (%, with reference_torque)" in text
+    assert [wheel["driven"] for wheel in found["wheel"]] == ["?"] * 4
+
+
 def test_the_remains_of_a_dbc_without_any_role_are_all_open(tmp_path, capsys):
     path = tmp_path / "doors.dbc"
     path.write_text('VERSION ""\nBU_: A\nBO_ 1 Doors: 8 A\n SG_ LeftOpen : 0|1@1+ (1,0) [0|1] "" A\n')

@@ -18,7 +18,9 @@ from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.configuration import configuration_warnings
-from soilbus.report.windows import summary_of, why_of_no_use
+from soilbus.report.page import Source
+from soilbus.report.replay import next_steps
+from soilbus.report.windows import summary, summary_of, why_of_no_use
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -128,3 +130,18 @@ def test_the_summary_says_why_no_go_is_given_without_a_draft(draft):
     seen = replace(seen, traversability=could, bearing=Estimate(1e5, 5e3))
     text = summary_of([seen], "a log", None, Counter())
     assert ("no sensor shows the draft" in text) is (draft is None)
+
+
+def test_a_replay_says_that_no_sensor_shows_the_slope(tmp_path):
+    config = reference_configuration()
+    level = config.model_copy(update={"signals": config.signals.model_copy(update={"pitch": None})})
+    log = tmp_path / "drive.log"
+    write_log(frames(simulate(config, excited("loam", 12.0), seed=2), config), log)
+    said = {}
+    for name, own in (("measured", config), ("level", level)):
+        pipeline = Pipeline(own, load_databases(own))
+        results = list(replay(pipeline, [log]))
+        steps = " ".join(sentence for sentence, _ in next_steps(results, Source(own)))
+        said[name] = (summary(results, pipeline), steps)
+    assert all("the ground counts as level" in text for text in said["level"])
+    assert not any("the ground counts as level" in text for text in said["measured"])

@@ -16,6 +16,7 @@ from rich.console import Console
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
+from soilbus.config.file import shipped_dbc
 from soilbus.report.block_letters import in_cells, in_half_cells
 from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.received_frames import ReceivedFrames
@@ -354,6 +355,45 @@ def test_who_comes_later_knows_only_how_long_the_first_window_takes_at_most():
     desk = Desk(Vehicle(window=5.0))
     said = waiting_for_first_window(desk, 3)
     assert said[2] == "UNKNOWN: at most 3 s until the first window"
+
+
+@pytest.mark.parametrize("uptime", [0, 500])
+def test_the_first_window_is_counted_down_again_after_a_restart_and_after_the_clock_was_set(desk, uptime):
+    waiting_for_first_window(desk, 3)
+    for _ in range(20 if uptime else 1):  # a restart may come before there was a window
+        desk.send(
+            "SoilbusStatus", State="valid" if uptime else "estimating", Reason="none", Window=7 if uptime else None
+        )
+        desk.send("SoilbusIdentity", Uptime=500)
+        desk.clock.now += 1.0
+    desk.send("SoilbusIdentity", Uptime=uptime)
+    desk.send("Traversability", State="unknown")
+    desk.send("SoilbusStatus", State="estimating", Reason="none")
+    assert desk.dashboard.verdict().said == "UNKNOWN: 10 s until the first window"
+
+
+def test_an_estimate_that_is_not_there_yet_is_not_called_old(desk):
+    desk.send("SoilbusStatus", State="estimating", Reason="none", Window=7)
+    desk.send("PresentDemand", Draft=900.0)
+    desk.send("Traversability", State="unknown", Age=0.6, Window=7)
+    assert desk.dashboard.verdict().said == "UNKNOWN: the next window is due"
+
+
+def test_frames_that_were_moved_to_identifiers_of_11_bits_are_read_under_these_alone(tmp_path):
+    text = shipped_dbc("soilbus.dbc").read_text()
+    for number, layout in enumerate(output_database(CONFIG).messages):
+        text = text.replace(str(layout.frame_id | 1 << 31), str(0x400 + number))
+    (tmp_path / "moved.dbc").write_text(re.sub(r".*VFrameFormat.*\n", "", text))
+    database = output_database(reference_configuration([f'output.dbc="{tmp_path / "moved.dbc"}"']))
+    known, publisher = ReceivedFrames(database, FakeClock()), Publisher(database)
+    frame = message(publisher.frame("Traversability", {"State": "go"}))
+    assert not frame.is_extended_id
+    frame.is_extended_id = True
+    known.receive(frame)
+    assert known.value("Traversability", "State") is None
+    frame.is_extended_id = False
+    known.receive(frame)
+    assert known.value("Traversability", "State") == "go"
 
 
 def test_the_slip_bar_is_of_the_wheel_that_slips_most_and_the_best_slip_of_its_axle(desk):

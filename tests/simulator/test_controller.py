@@ -26,6 +26,9 @@ ONTO_CLAY = Scenario(
     25.0, (Patch(0.0, "loam"), Patch(18.0, "wet_clay")), Swing(1.4, 1.4), draft=Swing(300.0, 300.0), lift_slip=None
 )
 
+CUT = can.Message(arbitration_id=0x18FF719A, data=b"\x01\x02")
+"""Set-points of a broken sender: no reader may fall over them."""
+
 
 class ClosedLoop:
     """A bus with the tractor and the service on it, whose time is that of the simulation."""
@@ -35,7 +38,10 @@ class ClosedLoop:
         self.lost_commands = 0
 
     def __iter__(self) -> Iterator[can.Message]:
-        return sent_beside(CONFIG, self._frames())
+        for message in sent_beside(CONFIG, self._frames()):
+            yield message
+            if message.arbitration_id == CUT.arbitration_id:
+                yield CUT
 
     def send(self, message: can.Message) -> None:
         self.lost_commands += not self._commands.take(message, self._now)

@@ -46,7 +46,7 @@ OF_SERVICE = COMMON | {
     "Type": "notify",
     "NotifyAccess": "main",
     "WatchdogSec": "10",  # a hung loop is killed; bus silence is no hang
-    "Restart": "on-failure",
+    "Restart": "always",  # kill -HUP is no stop
     "RestartPreventExitStatus": "2",  # a wrong configuration does not heal by restarting
     "StartLimitIntervalSec": "0",  # nobody on the field resets a failed unit
     "User": "soilbus",

@@ -53,7 +53,7 @@ def test_an_estimator_that_is_given_nothing_says_no_more_than_the_truth(machine,
 
 
 def without_stale_check(monkeypatch):
-    monkeypatch.setattr(Intake, "stale", lambda self, now: [])
+    monkeypatch.setattr(Intake, "stale", lambda self, now, since=0.0: [])
 
 
 def without_memory_of_epochs(monkeypatch):

@@ -27,12 +27,14 @@ from soilbus.can.units import Unit, unit_of
 __all__ = [
     "ASSERTED",
     "AXLES",
+    "UNIT_ALONE",
     "WHEELS",
     "Assignment",
     "Candidate",
     "Slot",
     "assigned",
     "candidates",
+    "dimensions_of",
     "is_word_in",
     "shown",
 ]
@@ -54,14 +56,15 @@ HINT = 0.25
 """The same of a word against a role, where the signal's own name speaks for it."""
 
 _ABBREVIATIONS: Mapping[str, str] = {
-    "torque": "tq trq trque torq", "speed": "spd vel velocity rpm sog revolution",
+    "torque": "tq trq trque torq", "speed": "spd vel velocity rpm sog revolution wss",
     "motor": "mot mtr mcu inv inverter emotor drv",
-    "shaft": "rotor", "wheel": "whl wh tyre tire", "axle": "axl", "load": "ld wgt weight fz",
+    "shaft": "rotor", "wheel": "whl wh tyre tire wss", "axle": "axl", "load": "ld wgt wght weight fz scale",
     "draft": "drft draught dft", "pull": "tow traction drawbar", "hitch": "htch linkage implement impl pin",
     "ground": "gnd radar gps gnss sog doppler overground", "sinkage": "sink rut", "height": "hgt ride",
     "pitch": "ptch", "slope": "grade inclination incline", "roll": "bank", "yaw": "gz", "rate": "rt",
     "acceleration": "acc accel accelerometer", "longitudinal": "lgt lon long along forward x ax",
     "lateral": "lat y ay", "vertical": "vert z az", "steering": "steer str eps mdps", "angle": "ang",
+    "force": "frc", "relative": "rel",
     "latitude": "lat", "longitude": "lon long lng", "position": "pos gps gnss",
     "differential": "diff", "lock": "locked lck",
     "limit": "lim max maximum avail available avl greatest", "least": "min minimum",
@@ -71,18 +74,32 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "state": "status stat", "current": "curr cur amps iq",
     "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
 }  # fmt: skip
+_GERMAN: Mapping[str, str] = {
+    "torque": "moment mom drehmoment drehmom", "speed": "drehzahl drehz geschwindigkeit geschw raddrehzahl raddrehz",
+    "motor": "asm psm", "wheel": "raddrehzahl raddrehz radlast", "axle": "achse achslast", "load": "radlast achslast",
+    "draft": "zugkraft", "force": "kraft", "pitch": "nick nickwinkel", "roll": "wank wankwinkel",
+    "yaw": "gier gierrate", "rate": "gierrate", "acceleration": "beschleunigung beschl laengsbeschl querbeschl",
+    "longitudinal": "laengs laengsbeschl", "lateral": "quer querbeschl", "steering": "lenk lenkwinkel",
+    "angle": "winkel lenkwinkel nickwinkel wankwinkel", "slope": "neigung", "request": "soll sollwert",
+    "actual": "ist istwert", "state": "zustand", "front": "vorn vorne", "rear": "hinten", "left": "links",
+    "right": "rechts",
+}  # fmt: skip
 _OTHER = (
     "force specific hand column pump fan cruise gravity course cog fraction coverage distance direction travel steady"
     " temperature voltage counter checksum percent rated loss friction north east up down link lift position"
 )
 _WORDS: dict[str, frozenset[str]] = {}
-for _word, _short in _ABBREVIATIONS.items():
+for _word, _short in (*_ABBREVIATIONS.items(), *_GERMAN.items()):
     for _spelling in (_word, *_short.split()):
         _WORDS[_spelling] = _WORDS.get(_spelling, frozenset()) | {_word}
 for _spelling in _OTHER.split():
     _WORDS.setdefault(_spelling, frozenset({_spelling}))
 
-_CORNERS = {"fl": "FL", "lf": "FL", "fr": "FR", "rf": "FR", "rl": "RL", "lr": "RL", "rr": "RR"}
+_CORNERS = {"fl": "FL", "lf": "FL", "fr": "FR", "rf": "FR", "rl": "RL", "lr": "RL", "rr": "RR"} | {
+    "vl": "FL", "vr": "FR", "hl": "RL", "hr": "RR"
+}  # fmt: skip
+_AXLE_LETTERS = {"f": ("r", "front"), "r": ("f", "rear"), "v": ("h", "front"), "h": ("v", "rear")}
+"""Letter of an axle: its counterpart, and the axle."""
 _GROUPS: Mapping[int, frozenset[str]] = {
     65093: frozenset({"draft", "rear"}), 65094: frozenset({"draft", "front"}), 65096: frozenset({"wheel"}),
     65097: frozenset({"ground"}), 65265: frozenset({"wheel"}), 65267: frozenset({"position"}),
@@ -100,11 +117,11 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
     "torque_limit": (("torque",), 0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
     "motor_speed": (
         ("rotation",), 0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
-        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit"},
+        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"},
     ),
     "speed": (
         ("rotation", "speed"), 0.1, {"wheel": 0.8, "speed": 0.2},
-        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground"},
+        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative"},
     ),
     "load": (
         ("force", "mass"), 0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
@@ -113,7 +130,9 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
     "sinkage": (("length",), 0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
     "ground_speed": (
         ("speed",), 0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
-        _ASKED | {"wheel", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"},
+        _ASKED
+        | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"}
+        | {"relative"},
     ),
     "draft": (
         ("force",), 0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
@@ -156,6 +175,10 @@ WHEEL_AND_AXLE = frozenset({"torque", "torque_limit", "motor_speed", "load"})
 WHEEL_ONLY = frozenset({"speed", "sinkage"})
 
 
+UNIT_ALONE = ""
+"""In the place of a role: a signal whose unit is one of ours, and whose name says nothing."""
+
+
 class Slot(NamedTuple):
     """A role and the wheel or axle that it is of; "" for the whole vehicle, or where the place is not known."""
 
@@ -189,22 +212,27 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """What is asserted by slot, the candidates of slots that stay open, best first, and rivals of asserted ones."""
+    """What is asserted by slot, the candidates of slots that stay open, best first, rivals of asserted ones, and
+    signals of which only the unit is known."""
 
     asserted: dict[Slot, Candidate] = field(default_factory=dict)
     open: dict[Slot, list[Candidate]] = field(default_factory=dict)
     rivals: list[Candidate] = field(default_factory=list)
+    unnamed: list[Candidate] = field(default_factory=list)
 
 
 def candidates(database: Database) -> list[Candidate]:
     """Every signal as a value of every slot that it may fill, with a score from LISTED up.
+
+    A signal that may fill none, but has a unit of ours, is one of UNIT_ALONE with score 0.
 
     Parameters
     ----------
     database
         Messages of the vehicle's bus.
     """
-    return [c for m in database.messages for s in m.signals for c in _of_signal(m, s)]
+    names = frozenset(name for m in database.messages for name in (m.name, *(s.name for s in m.signals)))
+    return [c for m in database.messages for s in m.signals for c in _of_signal(m, s, names)]
 
 
 def assigned(found: Iterable[Candidate]) -> Assignment:
@@ -218,7 +246,10 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
     from scipy.optimize import linear_sum_assignment
 
     best: dict[tuple[Slot, str], Candidate] = {}
+    out = Assignment()
     for c in found:
+        if c.slot.role == UNIT_ALONE:
+            out.unnamed.append(c)
         known = best.get((c.slot, c.path))
         if c.score >= LISTED and (known is None or c.score > known.score):
             best[c.slot, c.path] = c
@@ -228,7 +259,6 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
     for (slot, path), c in best.items():
         score[slots.index(slot), paths.index(path)] = c.score * (c.score >= ASSERTED)
     taken = {(slots[i], paths[j]) for i, j in zip(*linear_sum_assignment(-score), strict=True) if score[i, j] > 0.0}
-    out = Assignment()
     for slot in slots:
         elsewhere = {path for other, path in taken if other != slot}
         of_slot = [c for (s, path), c in best.items() if s == slot and path not in elsewhere]
@@ -241,6 +271,11 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
         elif of_slot:
             out.open[slot] = of_slot
     return out
+
+
+def dimensions_of(role: str) -> tuple[str, ...]:
+    """Dimensions that the unit of a role's signal may have."""
+    return _ROLES[role][0]
 
 
 def shown(candidate: Candidate) -> str:
@@ -258,16 +293,16 @@ def is_word_in(name: Candidate | str, *words: str) -> bool:
 # --- one signal ---
 
 
-def _of_signal(message: Message, signal: Signal) -> list[Candidate]:
+def _of_signal(message: Message, signal: Signal, names: frozenset[str]) -> list[Candidate]:
+    comment = signal.comment or ""
+    texts = (signal.name, message.name, *(message.senders or ()), comment)
+    place = next((p for text in texts if (p := _place(text) or _axle_by_letter(text, names))), "")
     try:
         unit = unit_of(signal.unit)
     except ValueError:
-        return _indirect(message, signal)
+        return _indirect(message, signal, place)
     group = pgn_of(message.frame_id) if message.is_extended_frame else 0
-    comment = signal.comment or ""
     own, around = _words(signal.name), _words(message.name) | _GROUPS.get(group, frozenset())
-    texts = (signal.name, message.name, *(message.senders or ()), comment)
-    place = next((p for text in texts if (p := _place(text))), "")
     found = []
     for role, (dimensions, *_) in _ROLES.items():
         if unit is not None and unit.dimension not in dimensions:
@@ -282,10 +317,15 @@ def _of_signal(message: Message, signal: Signal) -> list[Candidate]:
         if score >= LISTED:
             factor, dimension = (unit.factor, unit.dimension) if unit is not None else (1.0, dimensions[0])
             found.append(Candidate(slot, message.name, signal.name, score, signal.unit or "", factor, dimension, notes))
+    if not found and unit is not None and signal.length >= FEWEST_BITS and not own & (_ASKED | _OTHER_MACHINES):
+        slot = Slot(UNIT_ALONE, place)
+        said = ("relative to another",) if "relative" in own else ()
+        unnamed = Candidate(slot, message.name, signal.name, 0.0, signal.unit or "", unit.factor, unit.dimension, said)
+        found.append(unnamed)
     return found
 
 
-def _indirect(message: Message, signal: Signal) -> list[Candidate]:
+def _indirect(message: Message, signal: Signal, place: str) -> list[Candidate]:
     """A percentage or a current, which is a torque with a number that the DBC does not have: never asserted."""
     own, around, unit = _words(signal.name), _words(message.name), (signal.unit or "").strip()
     if own & _ASKED or "limit" in own:
@@ -295,7 +335,6 @@ def _indirect(message: Message, signal: Signal) -> list[Candidate]:
         note = "with reference_torque"
     elif unit in ("A", "mA", "kA") and "current" in own and "motor" in own | around:
         note = "with torque_constant"
-    place = next((p for text in (signal.name, message.name) if (p := _place(text))), "")
     slot, score = Slot("torque", place), (LISTED + ASSERTED) / 2.0
     return [Candidate(slot, message.name, signal.name, score, unit, 1.0, "torque", (note,))] if note else []
 
@@ -350,10 +389,14 @@ def _place_of(role: str, place: str) -> str:
 # --- words ---
 
 
+PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"
+"""A piece of a name: names are parted at underscores, capitals and digits."""
+
+
 @cache
 def _tokens(text: str) -> tuple[str, ...]:
     """Pieces of a name: at underscores, capitals and digits, and whole words run together."""
-    pieces = re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", text)
+    pieces = re.findall(PIECE, text)
     return tuple(part for piece in pieces for part in _parted(_singular(piece.casefold())))
 
 
@@ -374,6 +417,18 @@ def _parted(piece: str) -> tuple[str, ...]:
     return (piece,)
 
 
+def _axle_by_letter(text: str, names: frozenset[str]) -> str:
+    """front or rear by a letter of its own ("MCU_F_Tq"), where the DBC has the other axle's name, too."""
+    found = set()
+    for letter in re.finditer(PIECE, text):
+        if (token := letter[0].casefold()) in _AXLE_LETTERS:
+            other, axle = _AXLE_LETTERS[token]
+            other = other.upper() if letter[0].isupper() else other
+            if text[: letter.start()] + other + text[letter.end() :] in names:
+                found.add(axle)
+    return min(found) if len(found) == 1 else ""
+
+
 def _words(text: str) -> frozenset[str]:
     """What a text speaks of, places left out but for front, which says which wheels steer."""
     found = frozenset[str]().union(*(_WORDS.get(token, frozenset()) for token in _tokens(text)))
@@ -385,8 +440,9 @@ def _place(text: str) -> str:
     tokens = _tokens(text)
     along = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("front", "rear")}
     across = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("left", "right")}
-    if across and not along and "fr" in tokens:  # "FrLft"
-        along = {"front"}
+    if not along:  # "FrLft", "RrAxl"
+        axles = {here for here, following in pairwise(tokens) if "axle" in _WORDS.get(following, ())}
+        along = {_AXLE_LETTERS[t[0]][1] for t in (tokens if across else axles) if t in ("fr", "rr")}
     if len(along) == len(across) == 1:
         return {"front": "F", "rear": "R"}[min(along)] + {"left": "L", "right": "R"}[min(across)]
     corners = {_CORNERS[t] for t in tokens if t in _CORNERS}

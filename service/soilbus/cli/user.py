@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from soilbus.allocator import loading
 from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
 from soilbus.files import write_text
-from soilbus.process import say
+from soilbus.process import ENDING, say
 
 if TYPE_CHECKING:
     from soilbus.can.candump import Frame
@@ -92,8 +92,9 @@ def run(args: argparse.Namespace) -> None:
             service = start_service(config, wait)
         except BusError as error:
             raise WorkError(str(error)) from None
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: service.stop())
+    for number in ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
+            signal.signal(number, lambda *_: service.stop())
     service.run()
 
 

@@ -48,7 +48,7 @@ def with_effects_text(
     if config.dbc.input:
         document["dbc"]["input"] = [_from(place, config.folder, name) for name in config.dbc.input]
     if (renamed := _from(place, config.folder, config.output.dbc)) != config.output.dbc:
-        document["output"]["dbc"] = renamed
+        document.setdefault("output", tomlkit.table())["dbc"] = renamed
     return tomlkit.dumps(document)
 
 

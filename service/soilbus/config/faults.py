@@ -100,7 +100,7 @@ _OF_MACHINE = ("vehicle", *_REPEATED, "signals")
 
 
 def _number(given: Any, _: Mapping[str, Any]) -> str:
-    hint = "; without quotes" if isinstance(given, str) and _is_number(given) else ""
+    hint = f"; write {float(given):g}, without quotes" if isinstance(given, str) and _is_number(given) else ""
     return f"{_shown(given)} is not a number{hint}"
 
 

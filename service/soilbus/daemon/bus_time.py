@@ -1,10 +1,13 @@
 """Bus time, and up to which bus time all frames have been received.
 
-    bus time(now) = last stamp + (now - monotonic time at which that frame was taken)
+    bus time(now) = now + offset
+    stamp - now <= offset <= stamp - (when no frame was waiting last)      for each frame, taken at `now`
 
-Frames are stamped by the kernel's clock; the loop runs on the monotonic clock. A window ends when no frame of it can
-come any more: when a later frame was taken, when the bus says up to when it has delivered, or CLOSE_DELAY after the
-window's end at the latest.
+Frames are stamped by the kernel's clock; the loop runs on the monotonic clock. A frame was stamped before it is taken,
+and after the last moment when none was waiting: so frames that wait long in the kernel are known to be old.
+
+A window ends when no frame of it can come any more: when a later frame was taken, when the bus says up to when it has
+delivered, or CLOSE_DELAY after the window's end at the latest.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ class BusTime:
 
     def __init__(self, bus: LiveBus, now: float) -> None:
         self._bus = bus
-        self._stamp = 0.0
+        self._stamp, self._offset = 0.0, -math.inf
         self._nothing_left = now
         self.last_frame = -1e9
         """Monotonic time at which a frame was taken last."""
@@ -46,6 +49,7 @@ class BusTime:
     def took(self, stamp: float, now: float) -> None:
         """Note that a frame with this stamp [s] was taken at the monotonic time `now` [s]."""
         self._stamp, self.last_frame = stamp, now
+        self._offset = min(max(self._offset, stamp - now), stamp - self._nothing_left)
 
     def took_nothing(self, now: float) -> None:
         """Note that no frame was waiting at the monotonic time `now` [s]."""
@@ -53,7 +57,11 @@ class BusTime:
 
     def at(self, now: float) -> float:
         """Bus time [s] at the monotonic time `now` [s]; 0 before the first frame."""
-        return self._stamp + max(0.0, now - self.last_frame) if self.last_frame > 0.0 else 0.0
+        return max(self._stamp, now + self._offset) if self.last_frame > 0.0 else 0.0
+
+    def read_until(self, now: float) -> float:
+        """Bus time [s] up to which frames were taken: the last stamp where more may wait, else as `at`."""
+        return self._stamp if self._nothing_left < self.last_frame else self.at(now)
 
     def present(self, now: float) -> float:
         """Bus time [s] by the stamping clock itself where it can be read, else as `at`."""

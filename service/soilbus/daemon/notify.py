@@ -6,12 +6,12 @@ import logging
 import os
 import socket
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Notifier:
     """Sends to systemd's notification socket; without one every call does nothing.
 
@@ -26,6 +26,7 @@ class Notifier:
 
     address: str | None = None
     watchdog_interval: float | None = None
+    _fails: bool = field(default=False, init=False, repr=False)
 
     @classmethod
     def from_environment(cls, environ: Mapping[str, str] = os.environ) -> Notifier:
@@ -58,7 +59,11 @@ class Notifier:
                 s.setblocking(False)  # a stuck systemd must not stop the loop
                 s.sendto("\n".join(fields).encode(), address)
         except OSError as error:
-            log.warning("systemd not notified of %s: %s", fields[0], error)
+            if not self._fails:
+                log.warning("systemd not notified of %s: %s", fields[0], error.strerror or error)
+            self._fails = True
+            return
+        self._fails = False
 
 
 def _status(text: str) -> str:

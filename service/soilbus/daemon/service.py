@@ -67,8 +67,6 @@ MAX_CURVE_AGE = 60.0
 """Age [s] up to which a valid window's pull over slip is used to watch for immobilisation."""
 FOREIGN_SENDER_HOLD_TIME = 3.0
 """Time [s] for which another sender under our identifiers is reported, so that every reader sees it."""
-INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
-"""Reasons, beside bus-off and fault, that end the validity of every window that ended before."""
 
 
 class Service:
@@ -143,10 +141,12 @@ class Service:
         self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
+        self._inputs_since = -math.inf  # bus time since which inputs come in this epoch; -inf while there are none
         self._time = BusTime(bus, self._started)
         self._handed_out = -math.inf  # monotonic time at which the worker got a window last
         self._next_tick = self._started
         self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity", "BusHealth"), self._started)
+        self._counted = 0, 0  # samples refused, samples received until the last status
         self._lost = bus.counts.lost
         self._next_watchdog = self._started
         self._health, self._fault = Health(self._started), ""
@@ -273,8 +273,10 @@ class Service:
             self.bus.send(self.publisher.frame(message, values))
 
     def _vouched(self, result: WindowResult, ended: float, now: float) -> WindowResult:
-        """The result as it may go out: valid only where nothing has interrupted the inputs since its window's end."""
-        if result.status is Status.VALID and (ended <= self._interrupted or _interrupts(self._present_state(now))):
+        """The result as it may go out: valid only if it is young and no input has failed since its window's end."""
+        is_old = not self._time.at(now) - result.basis.end <= self.config.traversability.max_age  # nor nan
+        is_over = ended <= self._interrupted or self._interruption(now) is not None
+        if result.status is Status.VALID and (is_old or is_over):
             return replace(result, status=Status.DEGRADED)
         return result
 
@@ -300,9 +302,14 @@ class Service:
         if self.intake.epoch != self._epoch:
             self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
             self._loss, self._warned = NO_LOSS, False
+            self._inputs_since = -math.inf
+        if self._is_silent(now):
+            self._inputs_since = -math.inf
+        elif math.isinf(self._inputs_since):
+            self._inputs_since = self._time.at(now)
         self._look_after_health(now)
         self._state = self._present_state(now)
-        if _interrupts(self._state) or self.bus.counts.lost != self._lost:
+        if self._interruption(now) is not None or self.bus.counts.lost != self._lost:
             self._interrupted, self._lost = now, self.bus.counts.lost
         self._publish_ten_hertz(now)
         for message, due in self._due.items():
@@ -329,22 +336,34 @@ class Service:
             self.windows, self.deadline_misses, self.failures, self.bus.counts, self.intake.admission.counts
         )  # fmt: skip
 
-    def _present_state(self, now: float) -> tuple[ServiceState, str]:
+    def _is_silent(self, now: float) -> bool:
+        return now - self._time.last_frame > SILENCE_TIME
+
+    def _interruption(self, now: float) -> tuple[ServiceState, str] | None:
+        """What ends, at this moment, the validity of every window that ended before; None where nothing does."""
         if not self.bus.is_open:
             return ServiceState.WAITING, "bus_down"
         if self.bus.state is BusState.OFF:
             return ServiceState.WAITING, f"bus_error {self.bus.state}"
-        if now - self._time.last_frame > SILENCE_TIME:
+        if self._is_silent(now):
             return ServiceState.LISTENING, "no_frames"
-        stale = self.intake.stale(self._time.at(now))
-        if stale:
-            never = [name for name in stale if name not in self.intake.last_seen]
-            reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
-            return ServiceState.DEGRADED, reason
+        present, read = self._time.at(now), self._time.read_until(now)
+        if stale := self.intake.stale(present, self._inputs_since):
+            if not self.intake.stale(read, self._inputs_since):
+                return ServiceState.DEGRADED, f"overload frames are taken {present - read:.1f} s late"
+            return ServiceState.DEGRADED, self._why_stale(stale, now)
         if self._fault or self._guarded_estimator.in_fault:
             return ServiceState.FAULT, self._fault or INTERNAL
         if now - self.bus.last_foreign < FOREIGN_SENDER_HOLD_TIME:
             return ServiceState.DEGRADED, "foreign_sender"
+        return None
+
+    def _present_state(self, now: float) -> tuple[ServiceState, str]:
+        if (interruption := self._interruption(now)) is not None:
+            return interruption
+        ended = self._work_queue.oldest_end
+        if ended is not None and now - ended > self.config.traversability.max_age:
+            return ServiceState.DEGRADED, f"overload a window is not solved {now - ended:.1f} s after its end"
         if self.result is None or self._ended <= self._interrupted:
             return ServiceState.ESTIMATING, "none"
         reason = self.result.reason
@@ -353,6 +372,16 @@ class Service:
         if reason == "none" and self.bus.state is BusState.PASSIVE:
             reason = f"bus_error {self.bus.state}"
         return state_after(self.result), reason
+
+    def _why_stale(self, stale: list[str], now: float) -> str:
+        """Reason for channels without an accepted sample: silent since the start, silent now, or all refused."""
+        refused = self.intake.refused(self._time.at(now))
+        silent = [name for name in stale if name not in refused]
+        if never := [name for name in silent if name not in self.intake.last_seen]:
+            return "input_missing " + " ".join(never)
+        if silent:
+            return "input_stale " + " ".join(silent)
+        return "input_rejected " + " ".join(f"{name} ({refused[name]})" for name in stale)
 
     def present_decision(self, now: float) -> Traversability:
         """The present decision.
@@ -367,7 +396,7 @@ class Service:
         The decision of the last window, judged at `now`; unknown while an input is stale or a fault holds, and until
         a window has ended after the last interruption.
         """
-        if _interrupts(self._present_state(now)) or self._fault or self._guarded_estimator.in_fault:
+        if self._interruption(now) is not None:
             return Traversability()
         result = None if self._ended <= self._interrupted else self.result
         decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
@@ -438,6 +467,17 @@ class Service:
             },
         )
 
+    def _rejected_share(self) -> float | None:
+        """Share [%] of the input samples since the last call that were refused; None where there were none.
+
+        An outlier is refused up to a hop after it came.
+        """
+        refusals = self.intake.refusals
+        counts = refusals.refused, refusals.refused + refusals.used
+        refused, received = (n - before for n, before in zip(counts, self._counted, strict=True))
+        self._counted = counts
+        return 100.0 * min(refused / received, 1.0) if received else None
+
     def _publish_slow(self, message: str, now: float) -> None:
         state, reason = self._state
         if message == "SoilbusIdentity":
@@ -450,14 +490,12 @@ class Service:
         if message == "BusHealth":
             self._send(*health_frame(self.bus.state, self.bus.counts))
             return
-        counts = self.intake.admission.counts
-        received = sum(counts.received.values())
         self._send(
             message,
             {
                 "State": str(state),
                 "Reason": _first_word(reason),
-                "RejectedShare": 100.0 * sum(counts.refused.values()) / received if received else None,
+                "RejectedShare": self._rejected_share(),
                 "DeadlineMisses": self.deadline_misses,
                 "Window": self.result.index % WINDOW_MODULUS if self.result is not None else None,
             },
@@ -477,10 +515,6 @@ class Service:
             if beside is not None and (said := beside.status()):
                 text += f", {said}"
         self.notifier.status(text)
-
-
-def _interrupts(state: tuple[ServiceState, str]) -> bool:
-    return state[0] in (ServiceState.WAITING, ServiceState.FAULT) or _first_word(state[1]) in INTERRUPTIONS
 
 
 def _first_word(reason: str) -> str:

@@ -71,6 +71,11 @@ class WorkQueue:
         return self._busy_since if self._pending else None
 
     @property
+    def oldest_end(self) -> float | None:
+        """Monotonic time [s] at which the oldest window here ended; None where there is none."""
+        return self._pending[0].at if self._pending else None
+
+    @property
     def has_result(self) -> bool:
         """Whether the oldest window is solved."""
         return bool(self._pending) and self._pending[0].future.done()

@@ -69,6 +69,8 @@ def detectable(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> tuple[Detectable, ...]:
     """The detectable size of every candidate beside the present model fitted to these recordings."""
+    if not candidates:
+        return ()
     options = records[0].options
     divisor = temperature_beside(records, prior, present, options)
     excess = excess_without_effects(records, prior, present)

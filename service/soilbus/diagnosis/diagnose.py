@@ -144,6 +144,8 @@ def diagnose(
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
         present = with_delays(records, prior, present, temperature(present.excess, options))
+    if not present.converged and not present.gap < base.gap:  # such an end has no evidence, and predicts worse
+        additions, present = [], base
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
@@ -151,7 +153,8 @@ def diagnose(
     imitation = shares_alone(full, base, present, additions)
     chances = [addition.probability for addition in additions]
     rows = min(before.rows, after.rows)
-    verdict = verdict_of(before.value, after.value, rows, chances, bool(imitation), options)
+    is_doubtful = bool(imitation) or not (base.converged and present.converged)
+    verdict = verdict_of(before.value, after.value, rows, chances, is_doubtful, options)
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()
     if verdict is Verdict.NONE:

@@ -426,6 +426,11 @@ class _Natural(NamedTuple):
         return _Natural(self.information - other.information, self.vector - other.vector)
 
     @property
+    def is_proper(self) -> bool:
+        """Whether the information is positive definite."""
+        return bool(np.linalg.eigvalsh(self.information)[0] > 0.0)
+
+    @property
     def log_determinant(self) -> float:
         """Of the information."""
         return float(np.linalg.slogdet(self.information)[1])
@@ -453,7 +458,8 @@ def _swept(
     """Joint priors and fits at the optimum of all recordings together.
 
     The fits' -2 log evidence and posterior are such that they add up to those of all recordings.  A recording whose
-    fit fails keeps the one that it has.
+    fit fails keeps the one that it has, and so does one whose cavity is no distribution: where fits do not converge, a
+    factor may hold negative information.
     """
     shared = np.setdiff1d(np.flatnonzero(np.diag(first.covariance)[_SOIL:] > 0.0), own)
     if not len(shared):
@@ -467,6 +473,9 @@ def _swept(
             others = before
             for j, factor in enumerate(factors):
                 others = others if j == i else others + factor
+            if not others.is_proper:
+                moved = np.inf
+                continue
             cavity = _with_shared(Gaussian.of(prior, problem.gain_std), shared, others)
             fit = _fitted(problem, prior, cavity, _start(fits[i]), descent)
             if fit is None:

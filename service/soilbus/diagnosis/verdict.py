@@ -44,7 +44,7 @@ def verdict_of(
     after: float,
     rows: int,
     chances: Sequence[float],
-    imitation: bool = False,
+    is_doubtful: bool = False,
     options: DiagnosisOptions = DEFAULT,
 ) -> Verdict:
     """The verdict of a diagnosis.
@@ -57,14 +57,15 @@ def verdict_of(
         Held-out residuals of which the gaps are.
     chances
         Probability of each effect added.
-    imitation
-        Whether the effects explain the data only together, see `diagnose.shares_alone`.
+    is_doubtful
+        Whether the names are not to be trusted whatever their probability: the effects explain the data only together
+        (`diagnose.shares_alone`), or a fit did not converge, so that its evidence is none.
     """
     if is_unexplained(before, after, rows, options):
         return Verdict.UNKNOWN
     if not chances:
         return Verdict.NONE
-    return Verdict.NAMED if min(chances) >= options.named_probability and not imitation else Verdict.AMBIGUOUS
+    return Verdict.NAMED if min(chances) >= options.named_probability and not is_doubtful else Verdict.AMBIGUOUS
 
 
 def is_unexplained(before: float, after: float, checked_rows: int, options: DiagnosisOptions = DEFAULT) -> bool:

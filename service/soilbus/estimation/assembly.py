@@ -216,6 +216,7 @@ def _couplings(
     config: Config, of_axle: Mapping[str, tuple[int, ...]], drives: NDArray[np.bool_], groups: Mapping[str, list[Group]]
 ) -> Iterator[Coupling]:
     """The differentials: of each axle, and between the axles; wheels on one signal of speed turn together."""
+    is_switched = config.vehicle is not None and config.vehicle.differential_lock is not None
     together = [set(group.wheels) for group in groups["speed"] if len(group.wheels) > 1 and group.name not in of_axle]
     for name in ("front", "rear"):
         wheels, axle = [i for i in of_axle[name] if drives[i]], config.axle_named(name)
@@ -223,7 +224,7 @@ def _couplings(
         bias = DIFFERENTIAL_BIAS[kind] if axle is None or axle.torque_bias is None else axle.torque_bias
         for one, other in pairwise(wheels):
             rigid = any({one, other} <= wheels_together for wheels_together in together)
-            yield Coupling((one,), (other,), bias, kind == "locked" or rigid, kind == "open")
+            yield Coupling((one,), (other,), bias, kind == "locked" or rigid, kind == "open", is_switched=is_switched)
     centre = config.axle_named("both")
     front, rear = (tuple(i for i in of_axle[name] if drives[i]) for name in ("front", "rear"))
     if front and rear:
@@ -478,7 +479,7 @@ def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Ac
         if key not in names
     ]
     if effect.base_law not in (None, shear_law):
-        faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only")
+        faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only: set model.shear_law")
     values: dict[str, Any] = {}
     for parameter in effect.parameters:
         try:

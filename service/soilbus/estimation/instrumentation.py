@@ -65,7 +65,8 @@ class Coupling(NamedTuple):
     """Two sets of wheels behind a differential; ratio (W,): turns of the shaft before it for one of the wheel.
 
     bias: sd of the difference of the torques over their sum; locked: the speeds are equal, and the torques differ by
-    anything; is_open: the torques are equal but for friction; of_axle: the vehicle's differential lock acts on it.
+    anything; is_open: the torques are equal but for friction; of_axle: the vehicle's differential lock acts on it;
+    is_switched: a signal says whether it does.
     """
 
     one: tuple[int, ...]
@@ -74,6 +75,7 @@ class Coupling(NamedTuple):
     locked: bool
     is_open: bool
     of_axle: bool = True
+    is_switched: bool = False
 
 
 class Row(NamedTuple):
@@ -420,7 +422,7 @@ def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> t
         if row.kind == "coupling":
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
             size = np.abs(zero_if_unknown(shares)) @ weight + LEAST_TORQUE * grip @ weight
-            variance[:, i] = np.where(_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
+            variance[:, i] = np.where(_may_be_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
     return shares, np.where(np.isfinite(variance), torque, np.nan), variance
 
 
@@ -430,6 +432,14 @@ def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
     if coupling.of_axle and len(window.differential_lock):
         switched = zero_if_unknown(window.differential_lock) > 0.5
     return np.asarray(switched | coupling.locked)
+
+
+def _may_be_locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
+    """At which instants (N,) a differential is locked, or its lock is silent."""
+    locked = _locked(window, coupling)
+    if coupling.is_switched and len(window.differential_lock):
+        locked |= ~np.isfinite(window.differential_lock)
+    return locked
 
 
 def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:

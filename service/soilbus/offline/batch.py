@@ -17,6 +17,7 @@ import logging
 import math
 import os
 import shutil
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -47,10 +48,12 @@ from soilbus.offline.parts import Job, OtherVersion, Outcome, part_of, summary_o
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
-__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch"]
+__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch", "workers_watched"]
 
 CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
+WORKERS_COUNTED_EVERY = 10.0
+"""Seconds after which a scheduler is asked again whether it has workers."""
 TASKS_PER_THREAD = 3
 """Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
@@ -60,6 +63,8 @@ COMPARED = ("python", "dask", "distributed", "numpy")
 """Packages of which other versions may fail, or compute other last digits."""
 STATES_AT_ONCE = 32
 """Files that are asked for their state at once: of 80 000 logs on a server that answers in 50 ms in two minutes."""
+OF_DIAGNOSIS = ("diagnosis.json", "effects.parquet")
+"""What `--diagnose` writes."""
 MAX_SENT_BYTES = 256 * 2**20
 """Bytes of a log that is sent along; it is in memory on its way."""
 
@@ -80,6 +85,8 @@ class Batch:
         Logs that were done before this run, and those of them whose fault was kept.
     fleet
         Content of diagnosis.json; None where it was not asked for.
+    stale_diagnosis
+        Whether that of an earlier run was there, and is removed.
     cpu_seconds, log_bytes, duration
         Cost of the logs of this run: processor time [s] and bytes, for recordings of `duration` [s].
     """
@@ -93,6 +100,7 @@ class Batch:
     cpu_seconds: float
     log_bytes: int
     duration: float
+    stale_diagnosis: bool = False
 
 
 # --- Dask
@@ -149,13 +157,49 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
             if others := _other_versions(client):
                 say(f"{address}: other versions of {', '.join(others)} there than here: install the same everywhere")
             _announce(client, say)
-            yield client
+            with workers_watched(client, partial(_say_of, address, say)):
+                yield client
 
 
 def _announce(client: Any, say: Callable[[str], None]) -> None:
     """Where Dask's own dashboard is, if there is one."""
     if find_spec("bokeh") and client.scheduler_info().get("services", {}).get("dashboard"):
         say(f"Dask's dashboard: {client.dashboard_link}")
+
+
+def _say_of(address: str, say: Callable[[str], None], has_workers: bool) -> None:
+    lost = "its workers are gone: the batch waits until one comes back (ctrl-C stops it, --resume goes on from here)"
+    say(f"{address}: {'it has workers again' if has_workers else lost}")
+
+
+@contextmanager
+def workers_watched(
+    client: Any, report: Callable[[bool], None], every: float = WORKERS_COUNTED_EVERY
+) -> Iterator[None]:
+    """Call `report` with False when the last worker of a scheduler has gone, and with True when there is one again.
+
+    every: time between two looks [s].  A scheduler that is lost itself ends the watch: its tasks are cancelled.
+    """
+    ended = threading.Event()
+
+    def watch() -> None:
+        had_workers = True
+        while not ended.wait(every):
+            try:
+                has_workers = bool(client.nthreads())
+            except Exception:  # of each protocol its own
+                return
+            if has_workers != had_workers:
+                report(has_workers)
+            had_workers = has_workers
+
+    thread = threading.Thread(target=watch, name="workers", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def worker_version() -> str:
@@ -316,6 +360,9 @@ def run_batch(
     else:
         (out / "logs.parquet").unlink(missing_ok=True)
     dataset.write_rows(out / "vehicles.parquet", vehicles)
+    stale = [] if diagnose else [path for name in OF_DIAGNOSIS if (path := out / name).exists()]
+    for path in stale:
+        path.unlink()
     return Batch(
         vehicles,
         errors,
@@ -326,6 +373,7 @@ def run_batch(
         math.fsum(outcome.cpu_seconds for outcome in outcomes.values()),
         sum(outcome.log_bytes for outcome in outcomes.values()),
         math.fsum(summary["duration"] for digest, summary in summaries.items() if digest in outcomes),
+        bool(stale),
     )
 
 
@@ -512,8 +560,8 @@ def _diagnose_all(
         for vehicles in types.values()
     ]
     fleet = judged([of_type for of_type, _ in found], [each for _, findings in found for each in findings])
-    dataset.put(out / "diagnosis.json", (json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode())
-    dataset.write_rows(out / "effects.parquet", effect_rows(fleet), dataset.EFFECT_COLUMNS)
+    dataset.put(out / OF_DIAGNOSIS[0], (json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode())
+    dataset.write_rows(out / OF_DIAGNOSIS[1], effect_rows(fleet), dataset.EFFECT_COLUMNS)
     return fleet
 
 

@@ -10,13 +10,14 @@ import glob
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from functools import partial
+from io import BytesIO, TextIOWrapper
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from soilbus.config.model import Config
 from soilbus.offline import dataset
@@ -120,12 +121,16 @@ def _absolute(log: str) -> str:
 
 def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
     """Rows of a manifest, or one row that names the argument itself, which may be a table of a test rig."""
-    path = Path(argument)
-    if path.suffix.lower() not in TABLE_SUFFIXES or not path.is_file():
+    is_remote, suffix = "://" in argument, Path(file_name(argument)).suffix.lower()
+    is_there = not glob.has_magic(place_of(argument)) if is_remote else os.path.isfile(argument)
+    if suffix not in TABLE_SUFFIXES or not is_there:
         return [{"log": argument}]
     try:
-        header, rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _parquet_rows(path)
-    except (OSError, ValueError, csv.Error) as error:
+        with _opened(argument) as file:
+            header, rows = _csv_rows(file) if suffix == ".csv" else _parquet_rows(file)
+    except Exception as error:  # each protocol has its own
+        if is_remote:  # as a log it gets its line
+            return [{"log": argument}]
         raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
     if "log" not in header:
         if tables or len(header) in (0, CAN_CSV_COLUMNS):
@@ -133,18 +138,37 @@ def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
         raise BatchError(f"{argument}: a manifest needs a column log; its columns are {', '.join(header) or 'none'}")
     if not rows:
         raise BatchError(f"{argument}: no row in it")
-    return [_entry(path, number, row) for number, row in rows]
+    return [_entry(argument, number, row) for number, row in rows]
 
 
-def _entry(manifest: Path, number: int, row: Mapping[str, Any]) -> dict[str, str]:
+def _opened(argument: str) -> AbstractContextManager[IO[bytes]]:
+    """The file at a path or URL, to read."""
+    if "://" not in argument:
+        return Path(argument).open("rb")
+    import fsspec
+
+    opened: AbstractContextManager[IO[bytes]] = fsspec.open(argument, "rb")
+    return opened
+
+
+def _entry(manifest: str, number: int, row: Mapping[str, Any]) -> dict[str, str]:
     """A row's texts; paths in it begin at the manifest's folder."""
     texts = {name: _cell(row[name]) for name in MANIFEST_COLUMNS if name in row}
     if not texts["log"]:
         raise BatchError(f"{manifest}: row {number} has no log")
+    place, _, archive = place_of(manifest).partition("::")
+    folder, is_remote = place.rpartition("/")[0], "://" in manifest
     for name in ("log", "configuration"):
         text = texts.get(name)
-        if text and "://" not in text and not (name == "configuration" and _is_machine(manifest.parent / text)):
-            texts[name] = str(manifest.parent / text)
+        if not text or "://" in text or (name == "configuration" and _is_machine(Path(manifest).parent / text)):
+            continue
+        if not is_remote:
+            texts[name] = str(Path(manifest).parent / text)
+        elif name == "log":
+            texts[name] = text if text.startswith("/") else f"{folder}/{text}" + (f"::{archive}" if archive else "")
+        elif not text.startswith("/"):
+            what = "in a manifest by URL it is a reference machine's name or an absolute path"
+            raise BatchError(f"{manifest}: row {number}: configuration {text}: {what}")
     return texts
 
 
@@ -160,12 +184,11 @@ def _is_machine(configuration: Path) -> bool:
     return not configuration.suffix and not configuration.exists()
 
 
-def _csv_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+def _csv_rows(file: IO[bytes]) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
     """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
-    with path.open(newline="", encoding="utf-8-sig") as text:
+    with TextIOWrapper(file, newline="", encoding="utf-8-sig") as text:
         first = text.readline()
-        text.seek(0)
-        table = csv.reader(text, delimiter=max(SEPARATORS, key=first.count), strict=True)
+        table = csv.reader(chain([first], text), delimiter=max(SEPARATORS, key=first.count), strict=True)
         header = [name.strip().lower() for name in next(table, [])]
         if "log" not in header:
             return header, []
@@ -174,16 +197,17 @@ def _csv_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
         ]
 
 
-def _parquet_rows(path: Path) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+def _parquet_rows(file: IO[bytes]) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
     """Names of columns, and the numbered rows of a manifest."""
     import pyarrow.parquet as pq
 
-    columns = pq.read_schema(path).names
+    content = BytesIO(file.read()) if not file.seekable() else file
+    columns = pq.read_schema(content).names
     header = [name.strip().lower() for name in columns]
     if "log" not in header:
         return header, []
     wanted = [name for name, plain in zip(columns, header, strict=True) if plain in MANIFEST_COLUMNS]
-    table = pq.read_table(path, columns=wanted)
+    table = pq.read_table(content, columns=wanted)
     rows = table.rename_columns([name.strip().lower() for name in table.column_names]).to_pylist()
     return header, list(enumerate(rows, 1))
 

@@ -115,6 +115,11 @@ class Refusals:
     total: Counter[str] = field(default_factory=Counter)
     used: int = 0
 
+    @property
+    def refused(self) -> int:
+        """Samples refused since the start, for whatever reason."""
+        return sum(self.total.values())
+
     def add(self, decoded: Decoded) -> None:
         """Count what was used and refused of one batch of frames."""
         self.used += sum(len(column.t) for column in decoded.columns.values())
@@ -268,6 +273,7 @@ class Intake:
         self._implausible: tuple[str, ...] = ()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
+        self._last_refused: dict[str, tuple[float, str]] = {}
         self._newest = -math.inf  # stamp of the latest sample, admitted or refused
 
     def _screen_the_rest(self) -> None:
@@ -291,6 +297,8 @@ class Intake:
                 self.next_end = first - EDGE_LEAD + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
+        for (name, reason), t in decoded.refused.items():
+            self._last_refused[name] = max(self._last_refused.get(name, (-math.inf, "")), (float(t[-1]), str(reason)))
         for name, (t, value) in heard.items():
             if name.startswith("torque_limit."):
                 self._limits.add(name.removeprefix("torque_limit."), t, value)
@@ -373,13 +381,24 @@ class Intake:
         self._limits.drop_before(end)
         return task
 
-    def stale(self, now: float) -> list[str]:
-        """Names of needed channels without an accepted sample within their time-out before `now` [s]."""
+    def stale(self, now: float, since: float = -math.inf) -> list[str]:
+        """Names of needed channels without an accepted sample within their time-out before `now` [s].
+
+        A channel without any sample yet is stale when its time-out has passed after `since` [s].
+        """
         return [
             c.name
             for c in self.needed
-            if not now - self.last_seen.get(c.name, -math.inf) <= (c.timeout or DEFAULT_TIMEOUT)  # nor nan
+            if not now - self.last_seen.get(c.name, since) <= (c.timeout or DEFAULT_TIMEOUT)  # nor nan
         ]
+
+    def refused(self, now: float) -> dict[str, str]:
+        """Needed channels with a refused sample within their time-out before `now` [s], and why it was refused."""
+        return {
+            c.name: self._last_refused[c.name][1]
+            for c in self.needed
+            if c.name in self._last_refused and now - self._last_refused[c.name][0] <= (c.timeout or DEFAULT_TIMEOUT)
+        }
 
     def latest(self, now: float) -> Latest:
         """Slip, pull, motion, draft and pitch over the last `moment_span` before `now` [s]."""

@@ -53,7 +53,7 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
             off = f"the model is {np.sqrt(np.median(chi2)):.2g} times the noise off: " if chi2 else ""
             if what:
                 off += f"{what} is mapped for several wheels: if it is the cell of one, map it for that one alone; or "
-            return f"{off}check mass, radii, gear ratios and signs; else {DIAGNOSE}"
+            return f"{off}check mass, radii, gear ratios, signs and slope; else {DIAGNOSE}"
         case "no_convergence":
             return f"no soil explains these data ({_moved(windows)}): check signs and scales; else {DIAGNOSE}"
     return None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from soilbus.offline.batch import Batch
-from soilbus.report.table import table
+from soilbus.report.table import AT_EDGE, table, value_text
 
 MAX_ROWS = 40
 """Vehicles that the table lists; all are in vehicles.parquet."""
@@ -36,6 +36,8 @@ def batch_text(batch: Batch, out: Path) -> str:
         text += (
             f"cost of an hour of log: {batch.cpu_seconds / hours:.0f} CPU s, {batch.log_bytes / hours / 1e6:.1f} MB\n"
         )
+    if batch.stale_diagnosis:
+        text += "diagnosis.json and effects.parquet of an earlier run are removed; --diagnose writes them anew\n"
     return text + (fleet_text(batch.fleet) if batch.fleet else "")
 
 
@@ -65,7 +67,8 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
 
 
 def _sizes(effect: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {each['value']:.4g} ± {each['std']:.2g}" for name, each in effect["parameters"].items())
+    sizes = {name: (each["value"], each["std"]) for name, each in effect["parameters"].items()}
+    return ", ".join(f"{name} {value_text(*size, AT_EDGE, '±')}" for name, size in sizes.items())
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:

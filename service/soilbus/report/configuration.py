@@ -89,6 +89,20 @@ def configuration_warnings(config: Config) -> list[str]:
     return lines
 
 
+NO_SLOPE = (
+    'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
+    " and each per cent of slope as a draft of one per cent of the weight"
+)
+"""Of a vehicle that shows_no_slope()."""
+
+
+def shows_no_slope(config: Config) -> bool:
+    """Whether this is a vehicle of which no sensor shows the slope."""
+    felt = config.signals.acceleration
+    is_felt = config.signals.pitch is not None or (felt is not None and felt.kind == "specific_force")
+    return config.vehicle is not None and config.table is None and not is_felt
+
+
 def _lines_of_vehicle(config: Config) -> Iterator[str]:
     """A line for each key of the vehicle that contradicts what is mapped, or that nothing uses."""
     if config.vehicle is None or config.table is not None:
@@ -100,12 +114,8 @@ def _lines_of_vehicle(config: Config) -> Iterator[str]:
         )
     if config.vehicle.towing == "unknown" and config.signals.draft is not None:
         yield 'vehicle.towing = "unknown", but signals.draft is mapped and counts: "measured" is meant'
-    felt = config.signals.acceleration
-    if config.signals.pitch is None and (felt is None or felt.kind == "kinematic"):
-        yield (
-            'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
-            " and each per cent of slope as a draft of one per cent of the weight"
-        )
+    if shows_no_slope(config):
+        yield NO_SLOPE
     if config.vehicle.steering == "skid" and not (config.vehicle.track or config.signals.yaw_rate):
         yield (
             'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: how far the wheels slide'

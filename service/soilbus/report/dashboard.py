@@ -259,19 +259,25 @@ class Dashboard:
             and known.number("PresentDemand", "Draft") is None
         ):
             return "no sensor shows the draft", "Go carefully"
-        return REASONS.get(reason, ("the estimate is too old", MEASURING))
+        if reason in REASONS:
+            return REASONS[reason]
+        if known.value("SoilbusStatus", "State") == "estimating":
+            return "the next window is due", MEASURING
+        return "the estimate is too old", MEASURING
 
     def _watch_for_inputs(self) -> None:
         """Since when the service has had inputs, as a first window needs `window` seconds of them."""
-        state, reason = (self.known.value("SoilbusStatus", name) for name in ("State", "Reason"))
+        state, reason, window = (self.known.value("SoilbusStatus", name) for name in ("State", "Reason", "Window"))
         if state is None:
             return
-        if state in ("starting", "waiting") or reason in ("no_frames", "bus_down"):
+        if window is not None or state in ("starting", "waiting") or reason in ("no_frames", "bus_down"):
             self._inputs_since, self._saw_them_begin = None, True
-        elif self._inputs_since is None:
-            uptime = self.known.number("SoilbusIdentity", "Uptime")
-            self._saw_them_begin |= uptime is not None and uptime < 2.0
-            self._inputs_since = self.known.now
+            return
+        uptime = self.known.number("SoilbusIdentity", "Uptime")
+        has_begun = uptime is not None and uptime < 2.0
+        if self._inputs_since is None or has_begun:
+            self._saw_them_begin |= has_begun
+            self._inputs_since = self.known.now - (uptime if uptime is not None and has_begun else 0.0)
 
     def until_first_window(self) -> str | None:
         """How long until the first window has ended; None once there was one, or without inputs."""

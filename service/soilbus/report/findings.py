@@ -33,7 +33,7 @@ from soilbus.report.statement import (
     statement,
     why_probabilities,
 )
-from soilbus.report.table import table
+from soilbus.report.table import AT_EDGE, table, value_text
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 MAX_PLACES = 8
@@ -222,8 +222,8 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
     units |= {late.total: "s" for late in effect.late.values()}
     for name, estimate in completed.parameters()[effect.name].items():
         unit = units.get(name) or units[name.rpartition("_")[0]]
-        std = f"+- {estimate.std:.2g}" if estimate.std > 0.0 else "(held)"
-        lines.append(f"   {name} = {estimate.value:.4g} {std}" + ("" if unit == "1" else f" {unit}"))
+        size = value_text(estimate.value, estimate.std, AT_EDGE)
+        lines.append(f"   {name} = {size}" + ("" if unit == "1" else f" {unit}"))
     lines += [f"   {line}" for line in filter(None, [same_push(addition, completed)])]
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
@@ -264,7 +264,7 @@ def soil_rows(before: Posterior, after: Posterior, config: Config) -> list[tuple
 
 
 def _scaled(estimate: Estimate, unit: float) -> str:
-    return f"{estimate.value / unit:.4g} +- {estimate.std / unit:.2g}"
+    return value_text(estimate.value / unit, estimate.std / unit)
 
 
 def admission_line(findings: Findings) -> str:

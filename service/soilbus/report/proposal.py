@@ -16,7 +16,7 @@ from typing import NamedTuple
 from cantools.database.can import Database, Message
 
 from soilbus.can.mapping import VEHICLE_ROLES
-from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, is_word_in, shown
+from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, dimensions_of, is_word_in, shown
 from soilbus.config.file import OPEN
 from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts, is_absent
@@ -150,12 +150,16 @@ def _one_layout(assignment: Assignment) -> Assignment:
     for slot in assignment.asserted:
         if slot.role in ("torque", "torque_limit", "motor_speed"):
             left[slot] = [asserted.pop(slot)]
-    return Assignment(asserted, left, assignment.rivals)
+    return Assignment(asserted, left, assignment.rivals, assignment.unnamed)
 
 
 def _layout_of(draft: _Draft) -> _Layout:
     asserted = draft.assignment.asserted
     at = {place for role, place in asserted if role == "torque"}
+    if not at:  # one open candidate for each axle, or one for the vehicle: motors of axles all the same
+        own = {slot.place: cs for slot, cs in draft.assignment.open.items() if slot.role == "torque"}
+        if own.keys() <= {"", *AXLES} and all(len(cs) == 1 for cs in own.values()):
+            at = set(own)
     loads = {place for role, place in asserted if role == "load" and place in AXLES}
     if all(draft.matched("load", wheel) for wheel in WHEELS):
         loads = set()  # one measurement, not two
@@ -202,12 +206,16 @@ def _put_axle(draft: _Draft, axle: str) -> None:
         place = ""  # the motor of no name
         if axle:
             draft.note("the motor turns with this axle's wheels in the log")
-    if torque := draft.matched("torque", place):
+    known = draft.matched("torque", place)
+    if torque := known or next(iter(draft.assignment.open.get(Slot("torque", place), [])), None):
         speed = _beside(draft, torque, draft.matched("motor_speed", place))
         if speed is not None or not _is_at_wheel(torque):
             _put_gear(draft, axle)
         draft.put_open("differential", '"open", "locked" or "limited"')
-        draft.put_signal("torque", torque, **_side(torque))
+        if known is not None:
+            draft.put_signal("torque", torque, **_side(torque))
+        else:
+            draft.put_choice("torque", [torque], "")
         _put_limit(draft, torque, "axle")
         if speed is not None:
             draft.put_signal("motor_speed", speed)
@@ -329,6 +337,13 @@ def _put_rest(draft: _Draft) -> None:
     if perhaps := grouped((c for c in rest.values() if not is_absent(c)), lambda c: c.slot.role):
         draft.lines += ["", "# Not used, but perhaps:"]
         draft.lines += [f"#   {role}: {_listed(cs)}" for role, cs in perhaps.items()]
+    unnamed: dict[str, list[Candidate]] = {}
+    for c in known.unnamed:
+        if c.path not in draft.used | draft.named and not is_absent(c):
+            unnamed.setdefault(c.dimension, []).append(c)
+    if unnamed:
+        draft.lines += ["", "# Of no role that a name says; by their units:"]
+        draft.lines += [f"#   {dimension}: {_listed(cs)}" for dimension, cs in unnamed.items()]
     if absent := sorted(path for path, c in rest.items() if is_absent(c)):
         text = textwrap.fill(", ".join(absent), 116, break_long_words=False)
         draft.lines += ["", "# In the DBC, but never in the log:", *(f"#   {line}" for line in text.splitlines())]
@@ -338,11 +353,13 @@ def _put_rest(draft: _Draft) -> None:
 
 
 def _of_role(draft: _Draft, role: str, place: str) -> list[Candidate]:
-    """Candidates of an open slot, else those of the role wherever they are."""
+    """Candidates of an open slot, else those of the role wherever they are, else what has a unit of it there."""
     own = draft.assignment.open.get(Slot(role, place))
     anywhere = (c for slot, cs in draft.assignment.open.items() if slot.role == role for c in cs)
     loose = (c for slot, c in draft.assignment.asserted.items() if slot.role == role and not slot.place)
-    return own or sorted([*anywhere, *loose], key=lambda c: -c.score)
+    named = own or sorted([*anywhere, *loose], key=lambda c: -c.score)
+    fitting = dimensions_of(role)
+    return named or [c for c in draft.assignment.unnamed if c.slot.place == place and c.dimension in fitting]
 
 
 def _listed(found: Iterable[Candidate]) -> str:

@@ -40,7 +40,7 @@ class ReceivedFrames:
     """
 
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
-        self._messages = {m.frame_id: m for m in database.messages}
+        self._messages = {(m.frame_id, m.is_extended_frame): m for m in database.messages}
         self._signals = {m.name: {s.name: s for s in m.signals} for m in database.messages}
         self._cycle = {m.name: (m.cycle_time or 1000) / 1000.0 for m in database.messages}
         self._clock = clock
@@ -65,7 +65,7 @@ class ReceivedFrames:
 
     def receive(self, message: Received | can.Message) -> None:
         """Take one frame; a bad one (wrong checksum, repeated counter, not decodable) is counted and not used."""
-        layout = self._messages.get(message.arbitration_id) if message.is_extended_id else None
+        layout = self._messages.get((message.arbitration_id, message.is_extended_id))
         if layout is None or message.is_remote_frame or len(message.data) != layout.length:
             return
         place = checksum_byte_of(layout)

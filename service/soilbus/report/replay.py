@@ -13,6 +13,7 @@ from soilbus.decision.traversability import State, Status
 from soilbus.grouping import grouped
 from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.report.advice import advice, of_use
+from soilbus.report.configuration import NO_SLOPE, shows_no_slope
 from soilbus.report.page import Picture, Source, Table, page
 from soilbus.report.replay_pictures import (
     STATES,
@@ -121,6 +122,8 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tupl
         yield "Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html"
     if config.table is not None:
         return
+    if shows_no_slope(config):
+        yield f"{NO_SLOPE[0].upper()}{NO_SLOPE[1:]}.", ""
     if config.signals.latitude is None:
         yield "For a map of the route, map a position: signals.latitude and signals.longitude.", ""
     if not any(wheel.sinkage is not None for wheel in config.wheel):

@@ -115,15 +115,31 @@ def no_places(diagnosis: Diagnosis) -> str:
 
 
 def doubt(diagnosis: Diagnosis) -> str | None:
-    """Why effects that explain the data only together are doubtful; None for other effects."""
+    """Why the names are doubtful: open fits, effects that explain the data only together; None where they are not."""
+    found = [text for text in (_not_converged(diagnosis), _imitation(diagnosis)) if text is not None]
+    return "to be doubted: " + "; ".join(found) if found else None
+
+
+def _not_converged(diagnosis: Diagnosis) -> str | None:
+    models = (("present model", diagnosis.base), ("model with the effects", diagnosis.completed))
+    open_ends = [name for name, model in dict(models[: 1 + bool(diagnosis.additions)]).items() if not model.converged]
+    if not open_ends:
+        return None
+    return (
+        f"the fit of the {' and that of the '.join(open_ends)} did not converge, so evidence and names are a list of"
+        " what to check, no finding"
+    )
+
+
+def _imitation(diagnosis: Diagnosis) -> str | None:
     if not diagnosis.imitation:
         return None
     shares = zip(diagnosis.additions, diagnosis.imitation, strict=True)
     alone = ", ".join(f"{addition.effect.name} {100.0 * share:.0f} %" for addition, share in shares)
     against = [f"{a.effect.name}: {a.effect.ruled_out}" for a in diagnosis.additions if a.effect.ruled_out]
     text = (
-        f"to be doubted: of what they explain together each alone explains {alone}; separate faults would add up to "
-        "100 %, so these may be an imitation of something that the catalogue lacks"
+        f"of what they explain together each alone explains {alone}; separate faults would add up to 100 %, so these"
+        " may be an imitation of something that the catalogue lacks"
     )
     if against:
         text += f". What rules them out: {'; '.join(against)}"

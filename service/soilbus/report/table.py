@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+AT_EDGE = "at the edge of its range"
+"""Why an effect's parameter that was found has no standard deviation."""
+
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Left-aligned columns under a ruled head, one line a row."""
@@ -12,3 +15,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     text = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
     text.insert(1, "  ".join("-" * w for w in widths))
     return "\n".join(text) + "\n"
+
+
+def value_text(value: float, std: float, held: str = "held", sign: str = "+-") -> str:
+    """A value with its standard deviation, or why it has none."""
+    return f"{value:.4g} {sign} {std:.2g}" if std > 0.0 else f"{value:.4g} ({held})"

@@ -154,8 +154,8 @@ def watch_log(
         It cannot be read, or has no frame of ours.
     """
     database = output_database(config)
-    ours = {message.frame_id for message in database.messages}
-    source = PlayedLog((m for m in read_log(log) if m.is_extended_id and m.arbitration_id in ours), speed)
+    ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
+    source = PlayedLog((m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours), speed)
     if source.is_over:
         raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
     until = None if seconds is None else time.monotonic() + seconds

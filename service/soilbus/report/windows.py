@@ -16,6 +16,7 @@ from soilbus.grouping import grouped
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
+from soilbus.report.configuration import NO_SLOPE, shows_no_slope
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
@@ -32,10 +33,12 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
     if pipeline.admission.missed:
         heard += f"; {pipeline.admission.missed} skipped by their counters"
-    return summary_of(results, heard, refusals.used, refusals.total)
+    return summary_of(results, heard, refusals.used, refusals.total, shows_no_slope(pipeline.config))
 
 
-def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, refused: Counter[str]) -> str:
+def summary_of(
+    results: Sequence[WindowResult], heard: str, used: int | None, refused: Counter[str], no_slope: bool = False
+) -> str:
     """Summary of windows from any source.
 
     Parameters
@@ -48,6 +51,8 @@ def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, re
         Samples used; None where that was not counted.
     refused
         Samples refused by reason.
+    no_slope
+        Whether no sensor shows the slope.
     """
     good = [r for r in results if r.status is Status.VALID]
     estimated = len(of_use(results)) - len(good)
@@ -67,6 +72,8 @@ def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, re
     could_pull = [r for r in good if r.traversability.max_draft is not None]
     if any(r.traversability.state is State.UNKNOWN and r.excitation.draft is None for r in could_pull):
         lines.append("        no sensor shows the draft: no go, only what could be pulled (vehicle.towing)")
+    if no_slope:
+        lines.append(f"        {NO_SLOPE}")
     lines.append("failed solves " + counted(Counter(r.failure for r in results if r.failure)))
     lines.append("solver ended by " + counted(Counter(r.termination for r in results if r.termination)))
     if ended := sum(r.search_ended for r in results):

@@ -377,12 +377,18 @@ def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
     window = data.window
     lag = max(round(LAG / data.bin), 1)
     gained = change(smooth(window.ground_speed), lag)
-    reported = data.bin * moving_sum(window.acceleration, lag)
+    reported = data.bin * moving_sum(_without_slope(data), lag)
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
     reported_noise = data.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
     limits = (np.maximum(DEVIATIONS * sd, LEAST_SPEED) for sd in (noise, reported_noise))
     if _opposite(data, (gained, reported), limits, LEAST_SLOWING):
         yield "acceleration"
+
+
+def _without_slope(data: ConsistencyInput) -> Array:
+    """dv/dt [m/s^2] (N,) by the accelerometer; nan where it feels a slope that no pitch takes out."""
+    is_known = np.isfinite(data.window.pitch) | (not data.rig.specific_force)
+    return np.where(is_known, data.window.acceleration, np.nan)
 
 
 def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
@@ -426,7 +432,7 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
     window = data.window
     lag, n = max(round(LAG / data.bin), 1), max(round(COMPARED / data.bin), 1)
     gained = change(smooth(window.ground_speed), lag)
-    reported = data.bin * moving_sum(window.acceleration, lag)
+    reported = data.bin * moving_sum(_without_slope(data), lag)
     if len(reported) < n:
         return
     scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, round(ABOUT / data.bin))

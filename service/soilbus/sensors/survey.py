@@ -3,13 +3,14 @@
     weight      sum of the wheel loads = m g cos(pitch), and its share on each axle by moments
     gear        motor speed = gear ratio * wheel speed
     slip        1 - v / (r omega), within the range of driven wheels
+    transfer    changes of the front axle's load less the rear's = twice those by moments of draft, slope and inertia
     balance     changes of sum(torque / r) = 0.7 to 1.0 * changes of draft, and of slope + inertia
     sides       left less right: torque = a * load + b * slip + constant, with a > 0 and b > 0
 
 Mistakes of mapping (sign, unit, gear ratio, byte order, wheel) are large and constant, so each check compares means
 over the whole recording.  A wrong sign of a or b shows that loads, speeds or torques of left and right are swapped; all
 three swapped at once are the mirrored vehicle.  Where the recording varies too little, the survey says that it cannot
-decide.  Loads of a front and a rear wheel that carry the same load cannot be separated.
+decide.
 """
 
 from __future__ import annotations
@@ -80,6 +81,9 @@ class Limits:
     free: float = 0.25
     """Largest median slip, either way, of a wheel that rolls freely: wheels towed through soft soil skid by 0.1 to 0.2
     (Wong 2008, ch. 4); simulated ones on loam by 0.02."""
+    transfer: float = 0.75
+    """Least share of the load transfer by moments: 0 where a front and a rear cell are swapped, -1 where both are.  The
+    field vehicle has 1.2 +- 0.1 (on clay, where the draft hardly changes, 2.3 +- 0.5), a simulated drive 1.00."""
     scale: tuple[float, float] = (0.6, 1.3)
     """Range of the regression slope of thrust on draft."""
     excited: float = 0.008
@@ -158,7 +162,8 @@ class Facts(NamedTuple):
     """A recording in N bins.
 
     raw, window: as measured, and turned forward; straight (N,): where the vehicle drives straight on; motor (N, W):
-    motor speeds [rad/s]; shaft: those of motors of axles (N,), by axle; mapped: names of the mapped channels.
+    motor speeds [rad/s]; shaft: those of motors of axles (N,), by axle; mapped: names of the mapped channels;
+    by_radius: wheels whose speed is measured in m/s.
     """
 
     config: Config
@@ -169,6 +174,7 @@ class Facts(NamedTuple):
     motor: Array
     shaft: Mapping[str, Array]
     mapped: frozenset[str]
+    by_radius: frozenset[str]
 
     @property
     def slip(self) -> Array:
@@ -224,7 +230,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
         return Survey(seen, (Finding(text, True),), ())
     findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database))]
     findings += [*_stuck_and_jagged(seen, longest, config), *_mixed_rates(seen, config)]
-    facts = _facts(with_motors, mapped, longest)
+    facts = _facts(with_motors, mapped, longest, database)
     open_questions = [f"{s.channel.key}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
     if facts is not None:
         found, questions = _compared(facts, findings, channels, database)
@@ -260,6 +266,12 @@ def _rotation(text: str | None) -> bool:
     return unit is not None and unit.dimension == "rotation"
 
 
+def _is_in_metres(signal: Signal, database: Database) -> bool:
+    name, _, own = signal.signal.partition(".")
+    unit = unit_of(database.get_message_by_name(name).get_signal_by_name(own).unit)
+    return unit is not None and unit.dimension == "speed"
+
+
 def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
     t, value = heard.get(channel.name, (np.empty(0), np.empty(0)))
     rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 and t[-1] > t[0] else math.nan
@@ -268,7 +280,7 @@ def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason],
     return Seen(channel, len(t), float(rate), low, high, middle, why)
 
 
-def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | None:
+def _facts(config: Config, mapped: Iterable[str], heard: Columns, database: Database) -> Facts | None:
     """The recording in bins; None where no wheel is measured or nothing was heard of the rig."""
     rig, bin_length = rig_of(config), config.estimator.bin
     known = {name: column for name, column in heard.items() if name in set(rig.channels)}
@@ -292,7 +304,8 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | Non
     shaft = {name: bin_means(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
     moving = np.abs(window.ground_speed) > config.estimator.min_speed
     straight = moving & ~turning(window, rig, config.estimator.max_turn)
-    return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped))
+    by_radius = frozenset(w.name for w in config.wheel if w.speed is not None and _is_in_metres(w.speed, database))
+    return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped), by_radius)
 
 
 # --- one signal by itself ---
@@ -429,7 +442,8 @@ def _compared(
     findings: list[Finding] = []
     questions: list[str] = []
     checks = (
-        _weight, _directions, _gears, _axle_gears, _locked, _free_wheels, _slips, _balance, _levels, _sides, _yaw,
+        _weight, _directions, _gears, _axle_gears, _locked, _free_wheels, _slips, _balance, _levels, _slope, _transfer,
+        _sides, _yaw,
     )  # fmt: skip
     for check in checks:
         try:
@@ -450,6 +464,8 @@ def _weight(facts: Facts) -> Iterator[Finding]:
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
         return
+    if not any(name.startswith("load.") for name in facts.mapped):
+        raise UndecidableError("no load is measured: vehicle.mass and cg_ahead_of_rear_axle cannot be compared")
     names = tuple(f"load.{w}" for w in rig.wheels)
     pitch = np.where(np.isfinite(window.pitch), window.pitch, 0.0)
     measured = median(window.load.sum(axis=1) / np.cos(pitch))
@@ -494,6 +510,31 @@ def _weight(facts: Facts) -> Iterator[Finding]:
         )
 
 
+def _transfer(facts: Facts) -> Iterator[Finding]:
+    """Changes of each axle's load against those that draft, slope and inertia bring to it."""
+    window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
+    cells = [f"load.{wheel}" for wheel in rig.wheels]
+    if chassis is None or set(rig.front.tolist()) != {True, False} or not set(cells) <= facts.mapped:
+        return
+    known = (np.where(np.isfinite(a), a, 0.0) for a in (window.pitch, window.acceleration))
+    front = np.broadcast_to(axle_loads(chassis, window.draft, *known)[0], window.t.shape)
+    lag, block = _steps(facts)
+    more = window.load[:, rig.front].sum(axis=1) - window.load[:, ~rig.front].sum(axis=1)
+    rows = np.stack([change(more, lag), 2.0 * change(np.where(facts.straight, front, np.nan), lag)], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) < 40 * block:
+        return
+    y, x = _blocks(rows, block).T
+    (share,), (sd,) = _regression(y, x[:, None])
+    if share < LIMITS.transfer - LIMITS.side_sd * sd:
+        yield Finding(
+            f"load moves between front and rear wheels {share:.2f} times as much as draft, slope and inertia move it:"
+            " are loads of front and rear wheels swapped, or is hitch_height or cg_height wrong?",
+            True,
+            tuple(cells),
+        )
+
+
 def _why_weight(ratio: float) -> str:
     """The likely mistake if the loads are this multiple of the weight."""
     for factor, why in (
@@ -524,14 +565,19 @@ def _directions(facts: Facts) -> Iterator[Finding]:
     thrust = [median(facts.thrust[:, i]) for i in range(len(rig.wheels))]
     share = np.array(thrust) / max(np.nanmax(np.abs(thrust), initial=0.0), 1.0)
     drives = np.nansum(np.sign(share) * (np.abs(share) > 0.2))
-    for wheel, part in zip(rig.wheels, share.tolist(), strict=True):
-        if drives > 0.0 and part < -0.2:
-            yield Finding(
-                f"wheel.{wheel}.torque: brakes while most wheels drive: sign = -1?", True, (f"torque.{wheel}",)
-            )
+    braking = [wheel for wheel, part in zip(rig.wheels, share.tolist(), strict=True) if part < -0.2]
+    of_axles = {a.name: [w.name for w in facts.config.wheel if w.axle == a.name] for a in facts.config.axle if a.torque}
+    for axle, wheels in of_axles.items():
+        if wheels and set(wheels) <= set(braking) and drives >= 0.0:
+            braking = [wheel for wheel in braking if wheel not in wheels]
+            text = f"axle.{axle}.torque: brakes while the other axle drives: sign = -1?"
+            yield Finding(text, True, (f"torque.{axle}", *(f"torque.{wheel}" for wheel in wheels)))
+    for wheel in braking if drives > 0.0 else ():
+        yield Finding(f"wheel.{wheel}.torque: brakes while most wheels drive: sign = -1?", True, (f"torque.{wheel}",))
     ground = median(np.sign(raw.ground_speed[moving]))
     if ground < 0.0 and forward_sign > 0.0:
-        yield Finding("signals.ground_speed: backward while the wheels turn forward: sign = -1?", True)
+        text = "signals.ground_speed: backward while the wheels turn forward: sign = -1?"
+        yield Finding(text, True, ("ground_speed",))
 
 
 def _gears(facts: Facts) -> Iterator[Finding]:
@@ -546,11 +592,15 @@ def _gears(facts: Facts) -> Iterator[Finding]:
             continue
         yield Finding(
             f"wheel.{wheel}.gear_ratio = {own.gear_ratio:g}, but {own.motor_speed.signal} turns"
-            f" {own.gear_ratio * ratio:.4g} times as fast as the wheel: gear ratio, or unit or byte order of one of the"
-            " speeds?",
+            f" {own.gear_ratio * ratio:.4g} times as fast as the wheel: {_why_gear(facts, [wheel])}",
             True,
             (f"torque.{wheel}", f"motor_speed.{wheel}"),
         )
+
+
+def _why_gear(facts: Facts, wheels: Iterable[str]) -> str:
+    radius = " radius (the wheels' speeds are in m/s)," if facts.by_radius & set(wheels) else ""
+    return f"gear ratio,{radius} or unit or byte order of one of the speeds?"
 
 
 def _axle_gears(facts: Facts) -> Iterator[Finding]:
@@ -569,8 +619,7 @@ def _axle_gears(facts: Facts) -> Iterator[Finding]:
         elif math.isfinite(ratio) and abs(math.log(ratio)) > LIMITS.gear:
             yield Finding(
                 f"axle.{axle.name}.gear_ratio = {axle.gear_ratio:g}, but {axle.motor_speed.signal} turns"
-                f" {axle.gear_ratio * ratio:.4g} times as fast as the mean of its wheels: gear ratio, or unit or byte"
-                " order of one of the speeds?",
+                f" {axle.gear_ratio * ratio:.4g} times as fast as the mean of its wheels: {_why_gear(facts, names)}",
                 True,
                 channels,
             )
@@ -617,6 +666,8 @@ def _slips(facts: Facts) -> Iterator[Finding]:
     least = float(np.nanquantile(slip, 0.05)) if np.isfinite(slip).any() else math.nan
     middle = float(np.nanmedian(usual))
     at_shaft = any(w.speed is not None and w.speed.at == "shaft" for w in facts.config.wheel)
+    at_shaft = at_shaft or any(a.motor_speed is not None for a in facts.config.axle)
+    gear = "gear ratio, " if at_shaft else ""
     if middle < LIMITS.pushed or least > LIMITS.never_less:
         seems = middle if middle < LIMITS.pushed else least
         factor = 1.0 / (1.0 - seems)
@@ -625,7 +676,6 @@ def _slips(facts: Facts) -> Iterator[Finding]:
             if least > LIMITS.never_less
             else f"driving wheels seem to slip by {middle:.2f}"
         )
-        gear = "gear ratio, " if at_shaft else ""
         yield Finding(
             f"{text}: their rims go {factor:.2f} times as fast as the ground: {_why_fast(factor)}"
             f"{gear}radius, or unit, sign or byte order of ground and wheel speeds?",
@@ -633,11 +683,21 @@ def _slips(facts: Facts) -> Iterator[Finding]:
             ("ground_speed", *(f"speed.{w}" for w in rig.wheels)),
         )
         return
+    apart = {wheel: own - middle for wheel, own in zip(rig.wheels, usual.tolist(), strict=True)}
+    apart = {wheel: by for wheel, by in apart.items() if abs(by) > LIMITS.wheel_apart}
+    if 2 * len(apart) > np.isfinite(usual).sum():  # there are no most wheels
+        more, less = ([w for w, by in apart.items() if (by > 0.0) is is_more] for is_more in (True, False))
+        slips = [f"{' and '.join(w)} by {middle + np.mean([apart[i] for i in w]):.2f}" for w in (more, less) if w]
+        text = (
+            f"wheels seem to slip unlike: {', '.join(slips)}: radius, {gear}speed signal or its unit of some of them?"
+        )
+        yield Finding(text, True, tuple(f"speed.{w}" for w in rig.wheels))
+        return
     for wheel, own in zip(rig.wheels, usual.tolist(), strict=True):
-        if abs(own - middle) > LIMITS.wheel_apart:
+        if wheel in apart:
             yield Finding(
                 f"wheel.{wheel}: seems to slip by {own:.2f}, most wheels by {middle:.2f}: its radius,"
-                f" {'gear ratio, ' if at_shaft else ''}speed signal or its unit?",
+                f" {gear}speed signal or its unit?",
                 True,
                 (f"speed.{wheel}",),
             )
@@ -682,7 +742,7 @@ def _balance(facts: Facts) -> Iterator[Finding]:
         )
         return
     bin_length = facts.config.estimator.bin
-    lag, block = max(round(1.0 / bin_length), 1), max(round(0.5 / bin_length), 1)
+    lag, block = _steps(facts)
     inertia = pull_given(window, chassis) - window.draft
     changes = np.stack([change(a, lag) for a in (thrust, window.draft, inertia)], axis=1)
     changes = changes[np.isfinite(changes).all(axis=1)]
@@ -719,8 +779,8 @@ def _balance(facts: Facts) -> Iterator[Finding]:
         )
         return
     if of_inertia < -LIMITS.side_sd * inertia_sd:
-        slope = np.nanstd(change(window.pitch, lag)) * GRAVITY
-        name = "pitch" if slope > np.nanstd(change(window.acceleration, lag)) else "acceleration"
+        slope = _sd(change(window.pitch, lag)) * GRAVITY
+        name = "pitch" if slope > _sd(change(window.acceleration, lag)) else "acceleration"
         positive = "nose up" if name == "pitch" else "where the vehicle speeds up"
         yield Finding(
             f"signals.{name}: asks for less thrust whenever the wheels give more: its sign (positive {positive};"
@@ -728,6 +788,24 @@ def _balance(facts: Facts) -> Iterator[Finding]:
             True,
             (name,),
         )
+
+
+def _slope(facts: Facts) -> Iterator[Finding]:
+    """Changes of the wheels' thrust against those of the slope alone."""
+    window, chassis = facts.window, facts.rig.chassis
+    if chassis is None or "pitch" not in facts.mapped or not np.isfinite(window.pitch).any():
+        return
+    weight, (lag, block) = chassis.mass * GRAVITY, _steps(facts)
+    thrust, uphill = facts.thrust.sum(axis=1), weight * np.sin(window.pitch)
+    rest = pull_given(window, chassis) - uphill
+    rows = np.stack([change(a, lag) for a in (thrust, uphill, rest)], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) < 40 * block or (x := _blocks(rows, block))[:, 1].std() < LIMITS.excited * weight:
+        raise UndecidableError("the slope hardly changes: the sign of signals.pitch cannot be decided")
+    (of_slope, _), (sd, _) = _regression(x[:, 0], x[:, 1:])
+    if of_slope < -LIMITS.side_sd * sd:
+        text = "signals.pitch: the wheels thrust less uphill: its sign (positive nose up; sign = -1)?"
+        yield Finding(text, True, ("pitch",))
 
 
 def _levels(facts: Facts) -> Iterator[Finding]:
@@ -787,6 +865,18 @@ def _sides(facts: Facts) -> Iterator[Finding]:
                 " along: gear ratio, sign or scale of one of them?",
                 False,
             )
+
+
+def _steps(facts: Facts) -> tuple[int, int]:
+    """Bins in the second over which changes are compared, and in the half second over which they are averaged."""
+    bin_length = facts.config.estimator.bin
+    return max(round(1.0 / bin_length), 1), max(round(0.5 / bin_length), 1)
+
+
+def _sd(values: Array) -> float:
+    """Standard deviation of what is known; 0 of nothing."""
+    known = values[np.isfinite(values)]
+    return float(known.std()) if len(known) else 0.0
 
 
 def _blocks(values: Array, n: int) -> Array:
