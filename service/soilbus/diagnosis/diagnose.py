@@ -153,7 +153,7 @@ def diagnose(
     imitation = shares_alone(full, base, present, additions)
     chances = [addition.probability for addition in additions]
     rows = min(before.rows, after.rows)
-    is_doubtful = bool(imitation) or not (base.converged and present.converged)
+    is_doubtful = bool(imitation) or not base.converged
     verdict = verdict_of(before.value, after.value, rows, chances, is_doubtful, options)
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()

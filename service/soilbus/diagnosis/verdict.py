@@ -59,7 +59,7 @@ def verdict_of(
         Probability of each effect added.
     is_doubtful
         Whether the names are not to be trusted whatever their probability: the effects explain the data only together
-        (`diagnose.shares_alone`), or a fit did not converge, so that its evidence is none.
+        (`diagnose.shares_alone`), or the present model's fit did not converge, so that every fall from it is too large.
     """
     if is_unexplained(before, after, rows, options):
         return Verdict.UNKNOWN
