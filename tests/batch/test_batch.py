@@ -255,7 +255,7 @@ def test_a_diagnosis_of_an_earlier_run_does_not_stay_beside_other_logs(client, c
     batch = run_batch(client, jobs_of(config, "t", command, lambda _: config), out)
     assert not (out / "diagnosis.json").exists()
     assert not (out / "effects.parquet").exists()
-    assert "of an earlier run are removed; --diagnose writes them anew" in batch_text(batch, out)
+    assert "of an earlier run are removed; --diagnose writes them again" in batch_text(batch, out)
     again = run_batch(client, jobs_of(config, "t", command, lambda _: config), out)
     assert "of an earlier run" not in batch_text(again, out)
 

@@ -53,7 +53,7 @@ __all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in
 CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
 WORKERS_COUNTED_EVERY = 10.0
-"""Seconds after which a scheduler is asked again whether it has workers."""
+"""Seconds after which a scheduler is asked again whether it has workers; no evidence recorded."""
 TASKS_PER_THREAD = 3
 """Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}

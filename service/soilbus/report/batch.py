@@ -37,7 +37,7 @@ def batch_text(batch: Batch, out: Path) -> str:
             f"cost of an hour of log: {batch.cpu_seconds / hours:.0f} CPU s, {batch.log_bytes / hours / 1e6:.1f} MB\n"
         )
     if batch.stale_diagnosis:
-        text += "diagnosis.json and effects.parquet of an earlier run are removed; --diagnose writes them anew\n"
+        text += "diagnosis.json and effects.parquet of an earlier run are removed; --diagnose writes them again\n"
     return text + (fleet_text(batch.fleet) if batch.fleet else "")
 
 
