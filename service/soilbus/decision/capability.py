@@ -11,6 +11,7 @@ the results to the posterior's mode and draws, and finds each quantity draw by d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -238,6 +239,8 @@ def assess(
     )
     if max_draft is None:
         return None, table
+    max_draft, likely_pull = _with_mass_error(max_draft, rig), likely(None if pull is None else pull.pull)
+    max_pull = max_pull and _with_mass_error(max_pull, rig)
     max_draft_here = None
     if demand is not None and max_pull is not None:
         max_draft_here = Estimate(max_pull.value - table.axles.weight * demand.sine, max_pull.std)
@@ -247,12 +250,17 @@ def assess(
         max_grade=max_grade,
         max_grade_with_draft=max_grade_with_draft,
         max_pull=max_pull,
-        likely_pull=likely(None if pull is None else pull.pull),
+        likely_pull=likely_pull and _with_mass_error(likely_pull, rig),
         limit=draft.cause,
         set_points=_set_points(table.axles, level, vehicle.limits, draft),
         forecast=forecast,
         over_slip=_over_slip(level, table),
     ), table
+
+
+def _with_mass_error(pull: Estimate, rig: Rig) -> Estimate:
+    """A pull [N] with the std of the mass: it grows with the weight, at most in proportion."""
+    return Estimate(pull.value, math.hypot(pull.std, rig.mass_std * pull.value))
 
 
 @dataclass(frozen=True, slots=True)

@@ -228,7 +228,8 @@ def wheel_table(
         and np.array_equal(start.axles.drives, drives)
     ):
         start = None
-    axles = Axles.of(rig, drives) if start is None else start.axles
+    is_same = start is not None and start.axles.chassis == rig.chassis
+    axles = start.axles if start is not None and is_same else Axles.of(rig, drives)
     rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, ROLLING_SLIP)  # a track without thrust does not slip
     slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), rolling)
     if start is not None:

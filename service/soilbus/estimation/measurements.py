@@ -33,6 +33,7 @@ __all__ = [
     "Measurements",
     "differentiated_speed",
     "gain_names",
+    "gains_of",
     "travelled",
     "wheel_rotation",
 ]

@@ -96,6 +96,8 @@ class Rig:
     """Of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed."""
     lengths: Array | None = None
     """(W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels."""
+    mass_std: float = 0.0
+    """Relative sd of the mass in `chassis` [1], as far as decisions count it."""
     options: EstimatorOptions = field(default_factory=EstimatorOptions)
     """Tuning values of its estimator."""
 

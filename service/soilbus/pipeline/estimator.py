@@ -37,7 +37,7 @@ from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
-from soilbus.estimation.measurements import gain_names
+from soilbus.estimation.measurements import gains_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -55,6 +55,10 @@ from soilbus.terra.effects.steady import CompletedModel
 AMBIGUITY_SD = 2.0
 """Difference of bearing pressure or tan phi at a second mode, in standard deviations, from which a window is
 ambiguous.  No evidence recorded."""
+
+
+_WEIGHT = "load.weight"
+"""Name of the gain of the weight, where no load cell measures it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +83,8 @@ class Undecided:
         With the uncertainty that the window leaves of the effects' parameters and of the form.
     here
         Whether the estimate is of the present ground.
+    rig
+        The vehicle with its estimated mass.
     """
 
     result: WindowResult
@@ -89,6 +95,7 @@ class Undecided:
     fresh: bool
     model: UncertainModel
     here: bool
+    rig: Rig
 
 
 class WindowEstimator:
@@ -105,6 +112,7 @@ class WindowEstimator:
     def __init__(self, config: Config, tracker_of: Callable[..., Tracker] = Tracker) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
+        self._gain_names, self._gain_std = gains_of(self.rig)
         self._effects_and_parameters = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
@@ -188,11 +196,12 @@ class WindowEstimator:
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
-        demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
+        rig = self._with_estimated_mass(tracked)
+        demand = present_demand(window, rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
         limit = self._torque_limit(task, window)
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
-        return Undecided(result, known, demand, limit, window, task.fresh, model, here)
+        return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with traversability and watch; windows in their order, here or in another process."""
@@ -210,7 +219,7 @@ class WindowEstimator:
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
         decision, self._wheels = judge(
-            window.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
+            window.posterior, window.result.status, window.demand, window.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         return replace(window.result, traversability=self._with_state(decision, window))
@@ -288,9 +297,22 @@ class WindowEstimator:
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
         """Gain error of the draft sensor: posterior of the fit, else the prior."""
+        return self._gain(tracked, "draft")
+
+    def _with_estimated_mass(self, tracked: TrackerOutput) -> Rig:
+        """The rig with the mass m / (1 + gain of the weight) that the window estimates, where no load cell does."""
+        if self.rig.chassis is None or _WEIGHT not in self._gain_names:
+            return self.rig
+        error = self._gain(tracked, _WEIGHT)
+        chassis = replace(self.rig.chassis, mass=self.rig.chassis.mass / (1.0 + error.value))
+        return replace(self.rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
+
+    def _gain(self, tracked: TrackerOutput, name: str) -> Estimate:
+        """A sensor's or row's gain error: posterior of the fit, else the prior."""
+        index = self._gain_names.index(name)
         if tracked.fit is None or tracked.mismatch:
-            return Estimate(0.0, self.rig.noise["draft"].gain)
-        return tracked.fit.reported.gain(gain_names(self.rig).index("draft"))
+            return Estimate(0.0, self._gain_std[index])
+        return tracked.fit.reported.gain(index)
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
