@@ -39,7 +39,7 @@ def drafts(tmp_path_factory) -> dict[str, tuple[float, float]]:
     out = {}
     for name, config in {"known": rear_driven(true, 1.0), "open": rear_driven(sheet, 0.25 * sheet)}.items():
         decisions = [r.traversability for r in replay(Pipeline(config, load_databases(config)), [log])]
-        found = [d.max_draft for d in decisions if d is not None and d.max_draft is not None]
+        found = [(d.max_draft.value, d.max_draft.std) for d in decisions if d is not None and d.max_draft is not None]
         out[name] = tuple(np.median(found, axis=0).tolist())
     return out
 

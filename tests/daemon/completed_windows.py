@@ -39,6 +39,8 @@ class Times(NamedTuple):
     median: float
     most: float
     first: float
+    ratio: float
+    """Median over the windows of the time in plain windows [1]."""
 
 
 def completed(name: str) -> Config:
@@ -59,20 +61,20 @@ def recorded(folder: Path) -> Path:
 
 
 def times(log: Path, names: Iterable[str] = EFFECTS) -> Iterator[tuple[str, Times]]:
-    """All that the service does for a window: first without effects, then with each."""
-    yield "none", _times(log, reference_configuration())
+    """All that the service does for a window with each effect, and in turn for the same window without it.
+
+    So a machine that is busy meanwhile slows both.
+    """
     for name in names:
-        yield name, _times(log, completed(name))
-
-
-def _times(log: Path, config: Config) -> Times:
-    spent = 1e3 * seconds_of_windows(log, config).sum(1)
-    return Times(float(np.median(spent[1:])), float(spent[1:].max()), float(spent[0]))
+        both = zip(*(seconds_of_windows(log, c) for c in (reference_configuration(), completed(name))), strict=True)
+        plain, spent = 1e3 * np.array(list(both)).sum(-1).T
+        ratio = np.median(spent[1:] / plain[1:])
+        yield name, Times(float(np.median(spent[1:])), float(spent[1:].max()), float(spent[0]), float(ratio))
 
 
 def main() -> int:
     """Print the table."""
-    print(f"{'effect':20}{'median':>8}{'most':>8}{'first':>8}  ms a window")
+    print(f"{'effect':20}{'median':>8}{'most':>8}{'first':>8}  ms a window, in plain ones")
     with tempfile.TemporaryDirectory() as folder:
         for name, spent in times(recorded(Path(folder)), sys.argv[1:] or EFFECTS):
             print(f"{name:20}" + "".join(f"{t:8.1f}" for t in spent), flush=True)

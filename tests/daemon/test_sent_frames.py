@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import statistics
 import threading
 import time
 from collections import defaultdict
@@ -117,12 +118,15 @@ def test_a_live_service_sends_the_same_series(tmp_path):
     windows = [{values["Window"]: (t, values) for t, values in of["SoilStrength"]} for of in (live, replayed)]
     both = windows[0].keys() & windows[1].keys()
     assert len(both) >= 4
+    lags = []
     for window in both:
         (t_live, said), (t_replayed, again) = windows[0][window], windows[1][window]
         assert {k: v for k, v in said.items() if k not in ("Counter", "Checksum")} == {
             k: v for k, v in again.items() if k not in ("Counter", "Checksum")
         }
-        assert t_replayed == pytest.approx(t_live, abs=0.5)  # a busy machine's window may take long, never a hop
+        lags.append(t_live - t_replayed)
+    assert min(lags) > -0.1  # a cycle of the fast frames
+    assert statistics.median(lags) < 0.5  # the hop; a busy machine may take longer for one window
     states = [[(t, v["SlipWheel3"]) for t, v in of["WheelSlip"] if v["SlipWheel3"] != "not_available"] for of in
               (live, replayed)]  # fmt: skip
     pairs = [(slip, min(states[1], key=lambda other: abs(other[0] - t))) for t, slip in states[0]]

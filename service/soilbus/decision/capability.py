@@ -260,7 +260,7 @@ def assess(
 
 def _with_mass_error(pull: Estimate, rig: Rig) -> Estimate:
     """A pull [N] with the std of the mass: it grows with the weight, at most in proportion."""
-    return Estimate(pull.value, math.hypot(pull.std, rig.mass_std * pull.value))
+    return Estimate(pull.value, math.hypot(pull.std, rig.mass_std * pull.value)) if rig.mass_std else pull
 
 
 @dataclass(frozen=True, slots=True)

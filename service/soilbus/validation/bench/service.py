@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ def window_times(log: Path) -> dict[str, Figure]:
     tracker's); service_window_ms has decoding, binning and outlier test of the last hop and the decision besides.
     """
     config = reference_configuration()
-    intake, estimate, decision = 1e3 * np.min([seconds_of_windows(log, config) for _ in range(ROUNDS)], axis=0).T
+    intake, estimate, decision = 1e3 * np.min([list(seconds_of_windows(log, config)) for _ in range(ROUNDS)], axis=0).T
     whole = intake + estimate + decision
     count = f"{len(whole)} windows of 10 s, 1 s hop, four wheels"
     parts = ", ".join(
@@ -49,11 +50,10 @@ def window_times(log: Path) -> dict[str, Figure]:
     }  # fmt: skip
 
 
-def seconds_of_windows(log: Path, config: Config) -> NDArray[np.float64]:
-    """Processor seconds (windows, 3) of intake, estimate and decision of a log under a configuration."""
+def seconds_of_windows(log: Path, config: Config) -> Iterator[NDArray[np.float64]]:
+    """Processor seconds (3,) of intake, estimate and decision of each window of a log under a configuration."""
     pipeline = Pipeline(config, load_databases(config))
     intake, estimator = pipeline.intake, pipeline.estimator
-    times = []
     due = -np.inf
     for t, identifier, extended, data, remote, _ in read_frames(log):
         if t >= due:
@@ -64,8 +64,7 @@ def seconds_of_windows(log: Path, config: Config) -> NDArray[np.float64]:
                 marks.append(time.process_time())
                 estimator.decide(undecided)
                 marks.append(time.process_time())
-                times.append(np.diff(marks))
+                yield np.diff(marks)
                 marks = marks[-1:]
             due = min(intake.next_end, t + config.estimator.hop)
         intake.admission.feed(t, identifier, extended, data, remote)
-    return np.array(times)
