@@ -29,7 +29,7 @@ from soilbus.decision.stall_forecast import LONGEST_GAP, Sample, StallForecast, 
 from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window, pairs, pull_given
-from soilbus.sensors.consistency import NO_TRACTION, TRACTION
+from soilbus.sensors.options import CONSISTENCY
 from soilbus.terra.vehicle import GRAVITY
 
 if TYPE_CHECKING:
@@ -278,8 +278,8 @@ def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> N
     recent = window.t > since
     with np.errstate(invalid="ignore", divide="ignore"):
         traction = window.torque[recent] / (rig.radius * window.load[recent])
-        pulls = (traction > TRACTION).any(axis=1)
-        still = np.abs(traction[pulls]) < NO_TRACTION
+        pulls = (traction > CONSISTENCY.driving_traction).any(axis=1)
+        still = np.abs(traction[pulls]) < CONSISTENCY.idle_traction
     known = np.isfinite(traction[pulls])
     if 2 * pulls.sum() <= len(traction):
         return before

@@ -6,7 +6,7 @@
 A window of bins is checked as a whole, on the instants at which the vehicle drives straight on, and only what lasts
 counts.  Thresholds lie beyond what any soil, slope, driver or effect of `terra.effects` makes of good sensors; a fault
 that a soil could imitate (a draft somewhat off, one wheel that slips more) is left to the model, which then does not
-fit.  Each check sees the window without the channels that an earlier one has named.
+fit.  Each check sees the window without the channels that an earlier one has named.  Tuning values: `sensors.options`.
 """
 
 from __future__ import annotations
@@ -36,60 +36,11 @@ from soilbus.estimation.window import (
     zero_if_unknown,
 )
 from soilbus.sensors.bins import bin_means
+from soilbus.sensors.options import CONSISTENCY, ConsistencyOptions
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
 
-SUSTAINED = 1.0
-"""Seconds for which a contradiction must last."""
-DEVIATIONS = 5.0
-"""Standard deviations by which a change must stand out of the noise to count as one."""
-FALSE_SLIP = 0.12
-"""Slip that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
-LAG = 1.0
-"""Seconds over which changes are compared."""
-OPPOSITE = 0.85
-"""Share of significant changes that go the wrong way."""
-CORRELATION = -0.9
-"""Their correlation, at most."""
-LEAST_SLOWING, LEAST_PULLING = 2.0, 4.0
-"""Seconds of significant changes, one after the other, that there must be of speed and of pull: at the border of a
-soft soil a driver who lifts the implement may pull less and drive more for a moment."""
-LEAST_FORCE, LEAST_SPEED = 0.01, 0.05
-"""Changes of force, as a share of the weight, and of speed [m/s] below which none is significant."""
-COMPARED, CHANGING = 3.0, 0.06
-"""Seconds over which speed and acceleration are compared, and rms of the changes of speed [m/s] that there must be."""
-TOGETHER, MAY_BE, KNOWN = 0.985, 0.9, 0.9
-"""Their correlation at the best delay, at least, and at another one that may be theirs; share of bins with both."""
-OTHER_SCALE = math.log(1.35)
-"""Logarithm of the ratio of their changes from which they contradict each other."""
-AT_ONCE, ABOUT, JUMP, UNEXPLAINED = 0.3, 0.6, 0.25, 0.25
-"""A jump: at least JUMP [m/s] in AT_ONCE [s], of which the acceleration within ABOUT [s] of it explains less than
-the share UNEXPLAINED."""
 SAME = 1e-12
 """Relative difference of means of equal readings: rounding."""
-CHANCE = 1e-12
-"""Chance, by the noise that the sensor is said to have, below which a run of equal readings is a frozen sensor."""
-COARSE = 0.1
-"""Share of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen."""
-STILL_SHARE = 0.1
-"""Rim speed, as a share of the ground speed, below which a wheel does not turn."""
-BRAKED = 0.2
-"""Braking torque over load and radius from which a wheel may be locked."""
-GEAR_SLACK = 0.03
-"""Relative difference of motor and wheel speed that gear and radius of the wheel's sensor may have."""
-LEAST_TURN = 0.02
-"""Difference [rad/s] of the two that resolution and phase may make besides."""
-NO_TRACTION, TRACTION = 0.01, 0.15
-"""Torque over load and radius of a wheel that drives nothing (any soil resists more), and of one that surely drives."""
-ODD_SLIP = 0.2
-"""Distance from the other wheels' slip that speaks against the wheel's speed rather than its torque."""
-LOAD_SUM = 0.15
-"""Share of the weight by which the loads' sum must be wrong; lost zeros and what is carried stay below it."""
-LOAD_AXLE = 0.05
-"""Share of the weight by which the load transfer of an axle without fault may be wrong."""
-LOAD_SIDE = 0.10
-"""Share of an axle's load by which its left and right must differ more than the other axle's for one to be named."""
-ANY_LOAD = 0.6
-"""Wrong share of the weight that nothing carried explains, so that all load cells are wrong."""
 MOTOR_SPEED = "motor_speed"
 
 
@@ -118,11 +69,12 @@ class ConsistencyInput(NamedTuple):
     traction: Array
     motor_speed: Array
     resolution: Mapping[str, Resolution]
+    options: ConsistencyOptions
 
     @property
     def sustained(self) -> int:
         """Bins for which a contradiction must last."""
-        return max(round(SUSTAINED / self.bin), 1)
+        return max(round(self.options.contradiction_time / self.bin), 1)
 
 
 class Checked(NamedTuple):
@@ -197,6 +149,7 @@ def implausible(
     bin_length: float,
     resolution: Mapping[str, Resolution],
     motor_speed: Array | None = None,
+    options: ConsistencyOptions = CONSISTENCY,
 ) -> tuple[str, ...]:
     """Channels of a forward window (see `window.forward`) that lie in it, in the order of rig.channels.
 
@@ -211,7 +164,7 @@ def implausible(
         with np.errstate(invalid="ignore", divide="ignore"):
             traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
         slip = slip_ratio(rig.radius, window.speed, ground)
-        return ConsistencyInput(window, raw, rig, bin_length, driving, slip, traction, motor, resolution)
+        return ConsistencyInput(window, raw, rig, bin_length, driving, slip, traction, motor, resolution, options)
 
     motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
     data = seen(window, motor)
@@ -255,6 +208,7 @@ def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
 
 def frozen(data: ConsistencyInput) -> Iterator[str]:
     """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
+    options = data.options
     window, rig = data.raw, data.rig
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
     value = np.column_stack([getattr(window, q) for q in quantities])
@@ -270,14 +224,17 @@ def frozen(data: ConsistencyInput) -> Iterator[str]:
         noise, resolution = rig.noise[name.partition(".")[0]], data.resolution.get(name, Resolution(0.0, False))
         stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= data.sustained]
         within = sum(last - first for first, last in stretches)
-        if same[:, i].sum() - within > COARSE * (np.isfinite(value[:, i]).sum() - within):
+        if same[:, i].sum() - within > options.repeated_share * (np.isfinite(value[:, i]).sum() - within):
             continue
-        if any(_stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution) for a, b in stretches):
+        if any(
+            _stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution, options.frozen_probability)
+            for a, b in stretches
+        ):
             yield name
 
 
-def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolution) -> bool:
-    """Whether noise would have moved a reading that is the same in bins of these variances (N,).
+def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolution, probability: float) -> bool:
+    """Whether noise leaves a reading the same in bins of these variances (N,) with less than this probability.
 
     At most, where the truth is in the middle of the reading's step, noise leaves one sample
     in it with the chance erf(step / (2 sqrt(2) sd)).
@@ -289,19 +246,20 @@ def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolu
         return False
     samples = float((of_sample / variance).sum())
     same = math.erf(resolution.step / (2.0 * math.sqrt(2.0 * of_sample)))
-    return (samples - 1.0) * math.log(max(same, CHANCE)) < math.log(CHANCE)
+    return (samples - 1.0) * math.log(max(same, probability)) < math.log(probability)
 
 
 def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
     """Speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed where all of them rest."""
+    options = data.options
     window, rig = data.window, data.rig
     ground = window.ground_speed[:, None]
     with np.errstate(invalid="ignore"):
-        still = data.driving[:, None] & (rig.radius * window.speed < STILL_SHARE * ground)
+        still = data.driving[:, None] & (rig.radius * window.speed < options.still_share * ground)
         if not still.any():
             return
-        braked = data.traction < -BRAKED
-        idle = np.abs(data.traction) < NO_TRACTION
+        braked = data.traction < -options.braked_traction
+        idle = np.abs(data.traction) < options.idle_traction
     if lasts(np.logical_and.reduce(still & idle, axis=1), data.sustained):
         yield "ground_speed"
         return
@@ -315,12 +273,16 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
 
     Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
     """
+    options = data.options
     window, rig, motor = data.window, data.rig, data.motor_speed
     if not np.isfinite(motor).any():
         return
     with np.errstate(invalid="ignore"):
         noise = np.sqrt(2.0 * window.variance["speed"])
-        apart = np.abs(motor - window.speed) > GEAR_SLACK * np.abs(window.speed) + DEVIATIONS * noise + LEAST_TURN
+        apart = (
+            np.abs(motor - window.speed)
+            > options.gear_slack * np.abs(window.speed) + options.significant_sd * noise + options.min_turn_difference
+        )
     apart &= data.driving[:, None]
     wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], data.sustained)]
     good = [i for i in range(len(rig.wheels)) if i not in wrong]
@@ -337,6 +299,7 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
 
 def load_sum(data: ConsistencyInput) -> Iterator[str]:
     """The load that alone explains why the loads do not add up to the weight; all of them where nothing else can."""
+    options = data.options
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None or set(rig.front.tolist()) != {True, False}:
         return
@@ -344,14 +307,14 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
     excess = _axle_excess(window, rig, chassis) / weight
     total = excess.sum(axis=1)
     with np.errstate(invalid="ignore"):
-        wrong = data.driving & (np.abs(total) > LOAD_SUM)
+        wrong = data.driving & (np.abs(total) > options.load_sum)
     if not lasts(wrong, data.sustained):
         return
     front, rear = np.median(excess[wrong], axis=0)
-    if not -ANY_LOAD < front + rear < ANY_LOAD:
+    if not -options.any_load < front + rear < options.any_load:
         yield from (f"load.{wheel}" for wheel in rig.wheels)
         return
-    if min(abs(front), abs(rear)) > LOAD_AXLE:
+    if min(abs(front), abs(rear)) > options.load_axle:
         return  # something is carried
     of_axle = [np.flatnonzero(rig.front), np.flatnonzero(~rig.front)]
     bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
@@ -359,7 +322,7 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
         left, other = (
             median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
         )
-        if abs(left - other) > LOAD_SIDE:
+        if abs(left - other) > options.load_side:
             heavier = 0 if left > other else 1
             yield f"load.{rig.wheels[bad[heavier if front + rear > 0.0 else 1 - heavier]]}"
 
@@ -374,14 +337,15 @@ def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
 
 def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
     """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
+    options = data.options
     window = data.window
-    lag = max(round(LAG / data.bin), 1)
+    lag = max(round(options.change_time / data.bin), 1)
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
     reported_noise = data.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
-    limits = (np.maximum(DEVIATIONS * sd, LEAST_SPEED) for sd in (noise, reported_noise))
-    if _opposite(data, (gained, reported), limits, LEAST_SLOWING):
+    limits = (np.maximum(options.significant_sd * sd, options.min_speed_change) for sd in (noise, reported_noise))
+    if _opposite(data, (gained, reported), limits, options.opposite_speed_time):
         yield "acceleration"
 
 
@@ -393,10 +357,11 @@ def _without_slope(data: ConsistencyInput) -> Array:
 
 def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
     """Torques, speeds or the ground speed of wheels that slip without driving, or drive without slipping."""
+    options = data.options
     rig, slip, grip = data.rig, data.slip, data.traction
     with np.errstate(invalid="ignore"):
-        idle = (slip > FALSE_SLIP) & (grip < NO_TRACTION)
-        dragged = (slip < -FALSE_SLIP) & (grip > TRACTION)
+        idle = (slip > options.feigned_slip) & (grip < options.idle_traction)
+        dragged = (slip < -options.feigned_slip) & (grip > options.driving_traction)
     if not (idle.any() or dragged.any()):
         return
     idles = [i for i in range(len(rig.wheels)) if lasts(idle[:, i], data.sustained)]
@@ -411,7 +376,7 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
     for i in drags:
         where = dragged[:, i]
         usual = median(slip[where][:, others])
-        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > ODD_SLIP
+        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > options.odd_slip
         yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
 
 
@@ -420,7 +385,9 @@ def _pulls(data: ConsistencyInput, where: Mask) -> bool:
     chassis = data.rig.chassis
     if chassis is None:
         return bool(median(data.window.draft[where]) > 0.0)
-    return median(pull_given(data.window, chassis)[where]) > TRACTION / 3.0 * chassis.mass * GRAVITY
+    return (
+        median(pull_given(data.window, chassis)[where]) > data.options.driving_traction / 3.0 * chassis.mass * GRAVITY
+    )
 
 
 def speed_scale(data: ConsistencyInput) -> Iterator[str]:
@@ -429,27 +396,30 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
     Where the ground speed jumps it is the one; where the slip would be impossible with the
     one false it is the other; else it may be either, and both are named.
     """
+    options = data.options
     window = data.window
-    lag, n = max(round(LAG / data.bin), 1), max(round(COMPARED / data.bin), 1)
+    lag, n = max(round(options.change_time / data.bin), 1), max(round(options.scale_time / data.bin), 1)
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
     if len(reported) < n:
         return
-    scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, round(ABOUT / data.bin))
-    wrong = np.abs(np.log(scale)) > OTHER_SCALE  # nor nan
+    scale = _scales(
+        np.where(data.driving[lag:], gained, np.nan), reported, n, round(options.jump_lag / data.bin), options
+    )
+    wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
     if not wrong.any():
         return
     factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
     if _jumps(data):
         yield "ground_speed"
         return
-    if not 1.0 - (1.0 - seen) / factor < -FALSE_SLIP:
+    if not 1.0 - (1.0 - seen) / factor < -options.feigned_slip:
         yield "ground_speed"
-    if not seen < -FALSE_SLIP:
+    if not seen < -options.feigned_slip:
         yield "acceleration"
 
 
-def _scales(gained: Array, reported: Array, n: int, late: int) -> Array:
+def _scales(gained: Array, reported: Array, n: int, late: int, options: ConsistencyOptions) -> Array:
     """Ratios of speed gained to acceleration reported (both (M,)) in each n neighbours, (M - n + 1,); nan where unsure.
 
     Either may be late by up to `late` bins; of the delays with which the two may go together the
@@ -462,12 +432,12 @@ def _scales(gained: Array, reported: Array, n: int, late: int) -> Array:
     both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(
         len(reported), n
     )
-    enough = (count >= KNOWN * n) & (of_one > n * CHANGING**2) & (of_other > 0.0)
+    enough = (count >= options.known_share * n) & (of_one > n * options.min_speed_rms**2) & (of_other > 0.0)
     together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
-    scale = np.divide(both, of_other, where=together > MAY_BE, out=np.full(both.shape, np.inf))
+    scale = np.divide(both, of_other, where=together > options.possible_correlation, out=np.full(both.shape, np.inf))
     best = np.argmin(np.abs(np.log(scale)), axis=0)
     chosen = np.take_along_axis(scale, best[None], axis=0)[0]
-    return np.where(together.max(axis=0) > TOGETHER, chosen, np.nan)
+    return np.where(together.max(axis=0) > options.sure_correlation, chosen, np.nan)
 
 
 @lru_cache(maxsize=8)
@@ -486,29 +456,31 @@ def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
 
 def _jumps(data: ConsistencyInput) -> bool:
     """Whether the ground speed changes at once by what no acceleration about that time explains."""
+    options = data.options
     window = data.window
-    at_once, about = (max(round(span / data.bin), 1) for span in (AT_ONCE, ABOUT))
+    at_once, about = (max(round(span / data.bin), 1) for span in (options.jump_time, options.jump_lag))
     jump = np.abs(change(window.ground_speed, at_once))
     reported = np.abs(data.bin * moving_sum(zero_if_unknown(window.acceleration), at_once))
     most = neighbours(np.pad(reported, about), 2 * about + 1).max(axis=1)
     with np.errstate(invalid="ignore"):
-        return bool((data.driving[at_once:] & (jump > JUMP) & (most < UNEXPLAINED * jump)).any())
+        return bool((data.driving[at_once:] & (jump > options.jump) & (most < options.jump_explained * jump)).any())
 
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     """The draft, where the vehicle pulls less whenever its wheels drive more; needs slope and inertia."""
+    options = data.options
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None:
         return
-    lag, weight, variance = max(round(LAG / data.bin), 1), chassis.mass * GRAVITY, window.variance
+    lag, weight, variance = max(round(options.change_time / data.bin), 1), chassis.mass * GRAVITY, window.variance
     driven = change((window.torque / rig.radius).sum(axis=1), lag)
     noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
     known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
     pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
     pull_noise = np.sqrt(change_variance(of_pull, lag))
-    limits = (np.maximum(DEVIATIONS * sd, LEAST_FORCE * weight) for sd in (noise, pull_noise))
-    if _opposite(data, (driven, pull), limits, LEAST_PULLING):
+    limits = (np.maximum(options.significant_sd * sd, options.min_force_change * weight) for sd in (noise, pull_noise))
+    if _opposite(data, (driven, pull), limits, options.opposite_pull_time):
         yield "draft"
 
 
@@ -517,15 +489,21 @@ def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], limits: Iter
 
     Only instants count at which both changes exceed their limits (M,).
     """
+    options = data.options
     with np.errstate(invalid="ignore"):
         both = np.logical_and(*(np.abs(change) > limit for change, limit in zip(changes, limits, strict=True)))
     both &= data.driving[len(data.driving) - len(both) :]
     a, b = (change[both] for change in changes)
     product, n = a * b, max(round(seconds / data.bin), 1)
-    if np.count_nonzero(product < 0.0) < OPPOSITE * n:
+    if np.count_nonzero(product < 0.0) < options.opposite_share * n:
         return False
     opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
-    return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())
+    return bool(
+        (
+            (opposite >= options.opposite_share * n)
+            & (of_both < options.opposite_correlation * np.sqrt(of_one * of_other))
+        ).any()
+    )
 
 
 def running_sum(values: NDArray[Any], n: int) -> Array:

@@ -6,11 +6,12 @@
                  greatest |change of log pressure| / sd,  change of the model evaluations [%]
     types        types that get or lose an effect, types of which other vehicles agree, greatest change of a probability
     watch        boggings more or less in time, greatest change of a lead [s], false warnings more or less
+    consistency  faults of sensors found more or less, windows more or less in which a sound one is named
 
 Each field of the options is multiplied by 0.7 and by 1.3, counts rounded and changed by at least one, on fixed seeded
-drives, cases, types of vehicles and boggings (`estimates`, `diagnoses`, `types`, `watches`).  A field of the solver is
-changed in the joint descent from a cold start, and in other descents where they have a value of their own.  `--page`
-writes the tables of service/docs/sensitivity.md.
+drives, cases, types of vehicles, boggings and faults (`estimates`, `diagnoses`, `types`, `watches`,
+`contradictions`).  A field of the solver is changed in the joint descent from a cold start, and in other descents where
+they have a value of their own.  `--page` writes the tables of service/docs/sensitivity.md.
 """
 
 from __future__ import annotations
@@ -46,8 +47,11 @@ from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.options import EstimatorOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.tracker import Tracker
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import Rig, Window, forward
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.sensors import options as of_sensors
+from soilbus.sensors.consistency import implausible
+from soilbus.sensors.options import ConsistencyOptions
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -81,6 +85,26 @@ CASES: Mapping[str, Sequence[str]] = {
 is diagnosed as two recordings of one vehicle."""
 
 
+FAULTS: Mapping[str, tuple[Sequence[float], Callable[[Any, float], Any]]] = {
+    "load.FL": ((1.2, 1.5, 2.0, 3.0), lambda value, size: value * size),
+    "speed.FL": ((0.0, 0.7, 1.1, 1.3), lambda value, size: value * size),
+    "motor_speed.RR": ((0.95, 1.1), lambda value, size: value * size),
+    "torque.FL": ((0.0, -1.0), lambda value, size: value * size),
+    "draft": ((-1.0,), lambda value, size: size * value + 5e3),
+    "acceleration": ((-1.0, 0.6, 1.6), lambda value, size: value * size),
+    "ground_speed": ((0.6, 0.9, 1.2, 1.6), lambda value, size: value * np.where(np.arange(len(value)) < 50, 1.0, size)),
+    "pitch": ((7.0, 30.0), lambda value, size: np.where(np.arange(len(value)) < size, value[0], value)),
+}  # fmt: skip
+"""Sizes of a fault of each channel, about the limits, and what a channel with it reads: scaled, turned about, from half
+the window on, or frozen for this number of bins."""
+DRIVES = {
+    "even slip": Scenario(10.0, (Patch(0.0, "loam"),), slip=SWEPT),
+    "harsh slip": Scenario(10.0, (Patch(0.0, "loam"),), Swing(0.6, 2.5, 0.2, 0.5), slip=Swing(0.02, 0.6, 0.1, 0.4)),
+    "harsh draft": Scenario(10.0, (Patch(0.0, "loam"),), Swing(0.6, 2.5, 0.2, 0.5), draft=Swing(0.0, 6e3, 0.1, 0.4)),
+    "braking": Scenario(10.0, (Patch(0.0, "loam"),), Swing(0.6, 2.5, 0.2, 0.5), slip=Swing(-0.3, 0.3, 0.1, 0.4)),
+    "sand": Scenario(10.0, (Patch(0.0, "dry_sand"),), slip=Swing(0.05, 0.7)),
+}
+"""Drives with the faults, and without any."""
 GAIN = CATALOGUE["draft_gain"]
 TYPES = tuple(product((2, 3, 8, 40), (0.0, 0.2, 0.45), (0.0, 0.02, 0.1), (0.004, 0.03)))
 """Arguments of `factors_of_type`: few vehicles and many, equal and unequal ones, a clear value and a small one."""
@@ -120,7 +144,7 @@ def meanings(module: Any) -> Mapping[tuple[str, str], str]:
 
 def fields_of(options: Any, path: tuple[str, ...] = ()) -> Iterator[Field]:
     """All fields of options and of the options in them; of a descent only what is its own, but for `cold`."""
-    texts = {**meanings(of_estimator), **meanings(of_diagnosis), **meanings(of_watch)}
+    texts = {**meanings(of_estimator), **meanings(of_diagnosis), **meanings(of_watch), **meanings(of_sensors)}
     for field in fields(options):
         value, here = getattr(options, field.name), (*path, field.name)
         is_shared = isinstance(options, SolverOptions) and path[-1] != "cold" and value == field.default
@@ -363,6 +387,60 @@ def change_of_watches(before: Sequence[WarningTrial], after: Sequence[WarningTri
     return _words((in_time, "{:+d} in time"), (lead, "{:.1f} s"), (false, "{:+d} false"))
 
 
+class Contradiction(NamedTuple):
+    """The channels that are named in a window, and the one with a fault, if any."""
+
+    fault: str
+    named: tuple[str, ...]
+
+    @property
+    def is_false(self) -> bool:
+        """Whether a sound channel is named."""
+        return any(name != self.fault for name in self.named)
+
+
+@cache
+def faulty_windows() -> tuple[tuple[str, Window, Array], ...]:
+    """Channel with a fault, forward window and the motors' speeds (N, W), of each drive and fault."""
+    config = reference_configuration([f"wheel.{w}.motor_speed=Motor{w}.ShaftSpeed" for w in ("FL", "FR", "RL", "RR")])
+    rig, found = rig_of(config), []
+    for seed, scenario in enumerate(DRIVES.values(), start=511):
+        channels = simulate(config, scenario, seed).channels
+        window = forward(bins_of(config, channels).window(0.0, config.estimator.window))
+        of_motor = [channels[f"motor_speed.{w}"] for w in rig.wheels]
+        motor = np.stack([np.interp(window.t, c.t, c.value) for c in of_motor], axis=1)
+        found.append(("", window, motor))
+        for channel, (sizes, reads) in FAULTS.items():
+            quantity, _, wheel = channel.partition(".")
+            of_wheel = rig.wheels.index(wheel) if wheel else slice(None)
+            for size in sizes:
+                values = (motor if quantity == "motor_speed" else getattr(window, quantity)).copy()
+                values[..., of_wheel] = reads(values[..., of_wheel], size)
+                if quantity == "motor_speed":
+                    found.append((channel, window, values))
+                else:
+                    changed: dict[str, Any] = {quantity: values}
+                    found.append((channel, replace(window, **changed), motor))
+    return tuple(found)
+
+
+def contradictions(options: ConsistencyOptions) -> list[Contradiction]:
+    """What is named in each window."""
+    config = reference_configuration()
+    rig, s = rig_of(config), config.estimator
+    return [
+        Contradiction(fault, implausible(window, rig, s.min_speed, s.max_turn, s.bin, {}, motor, options))
+        for fault, window, motor in faulty_windows()
+    ]
+
+
+def change_of_contradictions(before: Sequence[Contradiction], after: Sequence[Contradiction]) -> str:
+    """What moved, in a few words; empty where nothing did."""
+    found = sum(one.fault in one.named for one in after) - sum(one.fault in one.named for one in before)
+    false = sum(one.is_false for one in after) - sum(one.is_false for one in before)
+    return _words((found, "{:+d} found"), (false, "{:+d} false"))
+
+
 def _words(*figures: tuple[float, str]) -> str:
     """The figures that do not round to zero, as they are printed."""
     texts = [text.format(value) for value, text in figures]
@@ -386,6 +464,7 @@ TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Callable[[Any, Any], str]], 
     ("diagnosis", DiagnosisOptions(), diagnoses, change_of_diagnoses),
     ("types", TypeOptions(), types, change_of_types),
     ("watch", WatchOptions(), watches, change_of_watches),
+    ("consistency", ConsistencyOptions(), contradictions, change_of_contradictions),
 )
 """Name, options, what they are tried on, and how two results are compared."""
 
