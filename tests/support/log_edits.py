@@ -15,9 +15,8 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.can.checksum import column_checksums
+from soilbus.can.checksum import checkable_byte, column_checksums
 from soilbus.can.decode import ColumnDecoder
-from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.publish import value_codes
 
 Frame = tuple[float, int, bool, bytes]
@@ -58,7 +57,7 @@ class Stream:
         return Stream(self.message, self.t, payload)
 
     def checked(self) -> Stream:
-        place = checksum_byte_of(self.message)
+        place = checkable_byte(self.message)
         if place is None:
             return self
         payload = self.payload.copy()
@@ -303,7 +302,7 @@ def broken_checksums(message: str) -> Edit:
 
     def edit(s: Stream, t: float) -> Stream:
         payload = s.payload.copy()
-        payload[s.t >= t, checksum_byte_of(s.message)] ^= 1
+        payload[s.t >= t, checkable_byte(s.message)] ^= 1
         return s.with_payload(payload)
 
     return lambda log, t: log.changed(message, lambda s: edit(s, t))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from cantools.database.can import Message
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
@@ -21,6 +22,20 @@ _XOR_OUT = 0xFF
 _ID_BYTES = 4
 _TABLE = bytes(Crc8SaeJ1850(initvalue=0).process((byte,)).value() for byte in range(256))
 _TABLE_ARRAY: NDArray[np.uint8] = np.frombuffer(_TABLE, dtype=np.uint8)
+
+
+def checksum_byte(message: Message) -> int | None:
+    """Byte that carries a message's Checksum; None without one that is an aligned byte."""
+    checksum = next((signal for signal in message.signals if signal.name == CHECKSUM), None)
+    if checksum is None or checksum.length != 8:
+        return None
+    aligned = 7 if checksum.byte_order == "big_endian" else 0
+    return int(checksum.start) // 8 if checksum.start % 8 == aligned else None
+
+
+def checkable_byte(message: Message) -> int | None:
+    """The same of a message with a Counter too, so that others may act on it; None of any other."""
+    return checksum_byte(message) if any(signal.name == COUNTER for signal in message.signals) else None
 
 
 def crc8(data: bytes) -> int:

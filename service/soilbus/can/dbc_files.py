@@ -11,9 +11,8 @@ from typing import Any
 
 from cantools.database.can import Database, Message
 
-from soilbus.can.checksum import CHECKSUM, COUNTER
+from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
 from soilbus.can.dbc_text import message_names, of_messages
-from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
 from soilbus.config.model import Config, ConfigError
@@ -79,7 +78,7 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
     with a line for each name that is in no DBC or cannot be checked.
     """
     ours = [path for name in config.dbc.input if _is_shipped(path := located(config.folder, name))]
-    found = {m.name for path in ours for m in _read(path).messages if checksum_byte_of(m) is not None}
+    found = {m.name for path in ours for m in _read(path).messages if checkable_byte(m) is not None}
     if not config.dbc.checked:
         return frozenset(found)
     known = {m.name: m for m in database.messages}
@@ -91,7 +90,7 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
     faults += [
         f"dbc.checked: {name} has no {COUNTER} and byte-aligned 8-bit {CHECKSUM}"
         for name in config.dbc.checked
-        if name in known and checksum_byte_of(known[name]) is None
+        if name in known and checkable_byte(known[name]) is None
     ]
     if faults:
         raise ConfigError(faults)

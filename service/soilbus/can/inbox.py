@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from cantools.database.can import Message, Signal
+from cantools.database.can import Message
 from numpy.typing import NDArray
 
 from soilbus.arrays import Mask
 from soilbus.can.channels import Channel
-from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
+from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
 from soilbus.can.decode import Block, ColumnDecoder
 from soilbus.can.j1939 import SourceLock, source_of
 from soilbus.can.plain import PlainPlan, plain_plan
@@ -80,20 +80,10 @@ class Inbox:
             self.lock.release()
 
 
-def checksum_byte_of(message: Message) -> int | None:
-    """Byte that carries a message's Checksum; None without a Counter and an aligned 8-bit Checksum."""
-    named: dict[str, Signal] = {s.name: s for s in message.signals}
-    checksum = named.get(CHECKSUM)
-    if checksum is None or COUNTER not in named or checksum.length != 8:
-        return None
-    aligned = 7 if checksum.byte_order == "big_endian" else 0
-    return checksum.start // 8 if checksum.start % 8 == aligned else None
-
-
 def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> Inbox:
     """An empty inbox; is_open: heard from any source.  ValueError where a message to be checked cannot be."""
-    checksum_byte = checksum_byte_of(message) if checked else None
-    if checked and checksum_byte is None:
+    place = checkable_byte(message) if checked else None
+    if checked and place is None:
         raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
     wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
     decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
@@ -105,7 +95,7 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
         decoder=decoder,
         plain=plain_plan(message, channels, rules, decoder),
         lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
-        checksum_byte=checksum_byte,
+        checksum_byte=place,
     )
 
 

@@ -18,7 +18,7 @@ from cantools.database import Database
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
-from soilbus.can.checksum import CHECKSUM, COUNTER, frame_checksum
+from soilbus.can.checksum import CHECKSUM, COUNTER, checksum_byte, frame_checksum
 
 NOT_AVAILABLE, ERROR = "not_available", "error"
 _BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
@@ -116,20 +116,6 @@ def _valid_codes(signal: Signal, least: int, greatest: int) -> tuple[int, int]:
     return least if low is None else max(low, least), greatest if high is None else min(high, greatest)
 
 
-def checksum_byte(message: Message) -> int | None:
-    """Index of the byte that carries the message's Checksum; None where it has none.
-
-    Raises ValueError for a Checksum that is not one whole byte.
-    """
-    for signal in message.signals:
-        if signal.name == CHECKSUM:
-            aligned = signal.start % 8 == (7 if signal.byte_order == "big_endian" else 0)
-            if signal.length != 8 or not aligned:
-                raise ValueError(f"{message.name}: {CHECKSUM} must be one whole byte")
-            return int(signal.start) // 8
-    return None
-
-
 @dataclass(slots=True)
 class _Layout:
     """One message, what its signals are filled with, and where its counter stands."""
@@ -189,4 +175,7 @@ def _layout(message: Message) -> _Layout:
     blank = {name: code.not_available for name, code in codes.items()}
     blank |= {name: 0 for name in (COUNTER, CHECKSUM) if name in by_name}
     modulus = 1 << by_name[COUNTER].length if COUNTER in by_name else 0
-    return _Layout(message, message.cycle_time / 1000.0, codes, blank, modulus, checksum_byte(message))
+    place = checksum_byte(message)
+    if place is None and CHECKSUM in by_name:
+        raise ValueError(f"{message.name}: {CHECKSUM} must be one whole byte")
+    return _Layout(message, message.cycle_time / 1000.0, codes, blank, modulus, place)

@@ -18,8 +18,7 @@ from cantools.database.can import Database
 from cantools.database.can.signal import Signal
 from cantools.database.namedsignalvalue import NamedSignalValue
 
-from soilbus.can.checksum import COUNTER, frame_checksum
-from soilbus.can.inbox import checksum_byte_of
+from soilbus.can.checksum import COUNTER, checkable_byte, frame_checksum
 from soilbus.can.wire import Received
 
 CYCLES_UNTIL_STALE = 3
@@ -68,7 +67,7 @@ class ReceivedFrames:
         layout = self._messages.get((message.arbitration_id, message.is_extended_id))
         if layout is None or message.is_remote_frame or len(message.data) != layout.length:
             return
-        place = checksum_byte_of(layout)
+        place = checkable_byte(layout)
         data = bytes(message.data)
         if place is not None and data[place] != frame_checksum(message.arbitration_id, data, place):
             self.bad_frames += 1
