@@ -9,7 +9,8 @@ no channel is left, what is known without measuring:
               T = 0                      a wheel that is not driven: solved for its slip, see `observation_model`
     speed     omega_left - omega_right   0, sd: SLIP_STD, nothing where the differential is locked
               omega = V / r (1 - s)      a wheel without sensor, until its torque says better
-    load      sum W = m g cos(pitch)     and the shift to the front axle by pitch, acceleration and draft
+    load      sum W = m g cos(pitch)     and what measured axles bounce; the shift to the front axle by pitch,
+                                         acceleration and draft
               W_left - W_right           from the roll angle; sd: what uneven ground adds
 
 So a channel of two wheels is one noise and one gain error.  Where every wheel has its own torque, speed and load, all M
@@ -331,8 +332,8 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
         direction = window.direction if len(window.direction) else np.ones(n)
         static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
         if row.kind == "weight":
-            load[:, i] = weight * np.cos(pitch)
-            scale[:, i], variance[:, i] = load[:, i], (given.load_noise / 2.0 * weight) ** 2
+            scale[:, i], variance[:, i] = weight * np.cos(pitch), (given.load_noise / 2.0 * weight) ** 2
+            load[:, i] = scale[:, i] + _heave(window, rig, given)
         elif row.kind == "transfer":
             along = direction * pitch, direction * zero_if_unknown(window.acceleration)
             draft, draft_var = _draft_on_hitch(window, rig)
@@ -361,6 +362,25 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             )
             variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
     return _solved(given.load, load), scale, variance, by_inertia, by_draft
+
+
+def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
+    """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N].
+
+    An axle bounces on its own tyres: with a dynamic index near one, as tractors have it, the other one does not lose
+    what it gains (Wong 2008, sect. 7.2.2).  Zero where no draft is known, as that shifts load between the axles.
+    """
+    assert rig.chassis is not None
+    direction = window.direction if len(window.direction) else np.ones(len(window.t))
+    along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
+    axles = axle_loads(rig.chassis, direction * window.draft, *along)
+    of_wheels = np.where(rig.front[:, None], axles[0] / rig.front.sum(), axles[1] / (~rig.front).sum())
+    beyond = np.zeros(len(window.t))
+    for row in given.load:
+        if row.kind == "channel":
+            beyond += window.load[:, row.at] - np.array(row.weight) @ of_wheels
+    known = np.isfinite(beyond)
+    return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))
 
 
 def _shows_slope(window: Window, rig: Rig) -> NDArray[np.bool_]:
