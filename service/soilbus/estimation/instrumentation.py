@@ -368,17 +368,16 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N].
 
     An axle bounces on its own tyres: with a dynamic index near one, as tractors have it, the other one does not lose
-    what it gains (Wong 2008, sect. 7.2.2).  Zero where no draft is known, as that shifts load between the axles.
+    what it gains (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, as that shifts load between the axles.
     """
-    assert rig.chassis is not None
+    channels = [row for row in given.load if row.kind == "channel"]
+    if rig.chassis is None or not channels:
+        return np.zeros(len(window.t))
     direction = window.direction if len(window.direction) else np.ones(len(window.t))
     along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
     axles = axle_loads(rig.chassis, direction * window.draft, *along)
-    of_wheels = np.where(rig.front[:, None], axles[0] / rig.front.sum(), axles[1] / (~rig.front).sum())
-    beyond = np.zeros(len(window.t))
-    for row in given.load:
-        if row.kind == "channel":
-            beyond += window.load[:, row.at] - np.array(row.weight) @ of_wheels
+    of_wheels = np.stack([axles[0 if front else 1] / np.sum(rig.front == front) for front in rig.front])
+    beyond = np.sum([window.load[:, row.at] - np.array(row.weight) @ of_wheels for row in channels], axis=0)
     known = np.isfinite(beyond)
     return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))
 
