@@ -9,8 +9,8 @@ no channel is left, what is known without measuring:
               T = 0                      a wheel that is not driven: solved for its slip, see `observation_model`
     speed     omega_left - omega_right   0, sd: SLIP_STD, nothing where the differential is locked
               omega = V / r (1 - s)      a wheel without sensor, until its torque says better
-    load      sum W = m g cos(pitch)     and what measured axles bounce; the shift to the front axle by pitch,
-                                         acceleration and draft
+    load      sum W = m g cos(pitch)     and heave: what measured axles bounce
+              front less rear            the shift to the front axle by pitch, acceleration and draft
               W_left - W_right           from the roll angle; sd: what uneven ground adds
 
 So a channel of two wheels is one noise and one gain error.  Where every wheel has its own torque, speed and load, all M
@@ -368,7 +368,7 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N].
 
     An axle bounces on its own tyres: with a dynamic index near one, as tractors have it, the other one does not lose
-    what it gains (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, as that shifts load between the axles.
+    what it gains (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, which shifts load between axles.
     """
     channels = [row for row in given.load if row.kind == "channel"]
     if rig.chassis is None or not channels:

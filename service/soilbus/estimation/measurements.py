@@ -29,6 +29,7 @@ from soilbus.terra.vehicle import GRAVITY
 
 __all__ = [
     "GAIN_QUANTITIES",
+    "MASS_GAIN",
     "Curves",
     "Measurements",
     "differentiated_speed",
@@ -60,6 +61,10 @@ _BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
 def gain_names(rig: Rig) -> list[str]:
     """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft."""
     return gains_of(rig)[0]
+
+
+MASS_GAIN = "load.weight"
+"""Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:

@@ -37,7 +37,7 @@ from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
-from soilbus.estimation.measurements import gains_of
+from soilbus.estimation.measurements import MASS_GAIN, gains_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -55,10 +55,6 @@ from soilbus.terra.effects.steady import CompletedModel
 AMBIGUITY_SD = 2.0
 """Difference of bearing pressure or tan phi at a second mode, in standard deviations, from which a window is
 ambiguous.  No evidence recorded."""
-
-
-_WEIGHT = "load.weight"
-"""Name of the gain of the weight, where no load cell measures it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,9 +297,9 @@ class WindowEstimator:
 
     def _with_estimated_mass(self, tracked: TrackerOutput) -> Rig:
         """The rig with the mass m / (1 + gain of the weight) that the window estimates, where no load cell does."""
-        if self.rig.chassis is None or _WEIGHT not in self._gain_names:
+        if self.rig.chassis is None or MASS_GAIN not in self._gain_names:
             return self.rig
-        error = self._gain(tracked, _WEIGHT)
+        error = self._gain(tracked, MASS_GAIN)
         chassis = replace(self.rig.chassis, mass=self.rig.chassis.mass / (1.0 + error.value))
         return replace(self.rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
 

@@ -498,12 +498,9 @@ def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], limits: Iter
     if np.count_nonzero(product < 0.0) < options.opposite_share * n:
         return False
     opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
-    return bool(
-        (
-            (opposite >= options.opposite_share * n)
-            & (of_both < options.opposite_correlation * np.sqrt(of_one * of_other))
-        ).any()
-    )
+    often = opposite >= options.opposite_share * n
+    closely = of_both < options.opposite_correlation * np.sqrt(of_one * of_other)
+    return bool((often & closely).any())
 
 
 def running_sum(values: NDArray[Any], n: int) -> Array:
