@@ -160,18 +160,18 @@ MUTATIONS = (
     ),
     Mutation(
         "one repeated reading makes a sensor coarse", "sensors/consistency.py",
-        "> COARSE * (np", "> 0.0 * (np",
+        "> options.repeated_share * (np", "> 0.0 * (np",
         ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
     ),
     Mutation(
         "no sensor is coarse", "sensors/consistency.py",
-        "> COARSE * (np", "> 1.0 * (np",
+        "> options.repeated_share * (np", "> 1.0 * (np",
         ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
     ),
     Mutation(
         "readings that repeat for long count as repeated elsewhere", "sensors/consistency.py",
-        "same[:, i].sum() - within > COARSE * (np.isfinite(value[:, i]).sum() - within)",
-        "same[:, i].sum() > COARSE * np.isfinite(value[:, i]).sum()",
+        "same[:, i].sum() - within > options.repeated_share * (np.isfinite(value[:, i]).sum() - within)",
+        "same[:, i].sum() > options.repeated_share * np.isfinite(value[:, i]).sum()",
         ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
     ),
     Mutation(

@@ -21,7 +21,7 @@ while read -r line; do
     eval "$line" </dev/null >"$n/said" 2>&1 || { echo "failed: $line"; cat "$n/said"; exit 1; }
     note "$n"
 done <commands
-for _ in 1 2 3 4 5 6 7 8 9 10; do # it starts while the last command asks
+for _ in $(seq 60); do # it starts while the last command asks
     if systemctl show -P StatusText $unit | grep -q '^listening'; then break; fi
     sleep 1
 done
