@@ -8,6 +8,7 @@ state written, read, refused and not written for a full disk, defects, stop, bad
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -64,7 +65,7 @@ def test_the_status_says_what_hangs(out: Path) -> None:
 @pytest.mark.systemd
 def test_defects_are_a_fault_and_no_end(out: Path) -> None:
     assert _restarts(out)["defect"] == 0
-    assert "failed solves: internal" in (out / "defect").read_text()
+    assert re.search(r"failed solves: .*internal [1-9]", (out / "defect").read_text())
     journal = (out / "defect.journal").read_text()
     assert journal.count("failed: ZeroDivisionError: a defect (sitecustomize.py:") == 3
     assert "Traceback" not in journal

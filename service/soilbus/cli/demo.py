@@ -76,7 +76,7 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
             worker.start()
             sender.start()
             dashboard = Dashboard(ReceivedFrames(ours), Vehicle.of(config), span=duration / TIME_COMPRESSION)
-            show(dashboard, ear, console, done=lambda: not sender.is_alive())
+            show(dashboard, ear, console, done=lambda: not (sender.is_alive() or service.has_open_windows))
             pictures = {name: page(dashboard, name, *PICTURE_SIZE) for name in ("driver", "engineer")}
             service.stop()
             worker.join(timeout=2.0)

@@ -226,10 +226,8 @@ def frozen(data: ConsistencyInput) -> Iterator[str]:
         within = sum(last - first for first, last in stretches)
         if same[:, i].sum() - within > options.repeated_share * (np.isfinite(value[:, i]).sum() - within):
             continue
-        if any(
-            _stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution, options.frozen_probability)
-            for a, b in stretches
-        ):
+        chance = math.erfc(options.significant_sd / math.sqrt(2.0))
+        if any(_stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution, chance) for a, b in stretches):
             yield name
 
 
@@ -258,7 +256,7 @@ def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
         still = data.driving[:, None] & (rig.radius * window.speed < options.still_share * ground)
         if not still.any():
             return
-        braked = data.traction < -options.braked_traction
+        braked = data.traction < -options.driving_traction
         idle = np.abs(data.traction) < options.idle_traction
     if lasts(np.logical_and.reduce(still & idle, axis=1), data.sustained):
         yield "ground_speed"
@@ -280,8 +278,7 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
     with np.errstate(invalid="ignore"):
         noise = np.sqrt(2.0 * window.variance["speed"])
         apart = (
-            np.abs(motor - window.speed)
-            > options.gear_slack * np.abs(window.speed) + options.significant_sd * noise + options.min_turn_difference
+            np.abs(motor - window.speed) > options.gear_slack * np.abs(window.speed) + options.significant_sd * noise
         )
     apart &= data.driving[:, None]
     wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], data.sustained)]
@@ -314,7 +311,7 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
     if not -options.any_load < front + rear < options.any_load:
         yield from (f"load.{wheel}" for wheel in rig.wheels)
         return
-    if min(abs(front), abs(rear)) > options.load_axle:
+    if min(abs(front), abs(rear)) > options.load_side:
         return  # something is carried
     of_axle = [np.flatnonzero(rig.front), np.flatnonzero(~rig.front)]
     bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
@@ -344,8 +341,7 @@ def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
     reported = data.bin * moving_sum(_without_slope(data), lag)
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
     reported_noise = data.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
-    limits = (np.maximum(options.significant_sd * sd, options.min_speed_change) for sd in (noise, reported_noise))
-    if _opposite(data, (gained, reported), limits, options.opposite_speed_time):
+    if _opposite(data, (gained, reported), (noise, reported_noise)):
         yield "acceleration"
 
 
@@ -376,7 +372,7 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
     for i in drags:
         where = dragged[:, i]
         usual = median(slip[where][:, others])
-        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > options.odd_slip
+        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > options.feigned_slip
         yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
 
 
@@ -404,7 +400,7 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
     if len(reported) < n:
         return
     scale = _scales(
-        np.where(data.driving[lag:], gained, np.nan), reported, n, round(options.jump_lag / data.bin), options
+        np.where(data.driving[lag:], gained, np.nan), reported, n, round(options.max_delay / data.bin), options
     )
     wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
     if not wrong.any():
@@ -456,14 +452,16 @@ def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
 
 def _jumps(data: ConsistencyInput) -> bool:
     """Whether the ground speed changes at once by what no acceleration about that time explains."""
-    options = data.options
-    window = data.window
-    at_once, about = (max(round(span / data.bin), 1) for span in (options.jump_time, options.jump_lag))
-    jump = np.abs(change(window.ground_speed, at_once))
-    reported = np.abs(data.bin * moving_sum(zero_if_unknown(window.acceleration), at_once))
-    most = neighbours(np.pad(reported, about), 2 * about + 1).max(axis=1)
+    options, window = data.options, data.window
+    late = max(round(options.max_delay / data.bin), 1)
+    lag = max(late // 2, 1)  # a change faster than their delay
+    jump = np.abs(change(window.ground_speed, lag))
+    noise = np.sqrt(change_variance(window.variance["ground_speed"], lag))
+    reported = np.abs(data.bin * moving_sum(zero_if_unknown(window.acceleration), lag))
+    most = neighbours(np.pad(reported, late), 2 * late + 1).max(axis=1)
     with np.errstate(invalid="ignore"):
-        return bool((data.driving[at_once:] & (jump > options.jump) & (most < options.jump_explained * jump)).any())
+        stands_out = (jump > options.significant_sd * noise) & (most < options.jump_explained * jump)
+        return bool((data.driving[lag:] & stands_out).any())
 
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
@@ -479,22 +477,21 @@ def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
     pull_noise = np.sqrt(change_variance(of_pull, lag))
-    limits = (np.maximum(options.significant_sd * sd, options.min_force_change * weight) for sd in (noise, pull_noise))
-    if _opposite(data, (driven, pull), limits, options.opposite_pull_time):
+    if _opposite(data, (driven, pull), (noise, pull_noise)):
         yield "draft"
 
 
-def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], limits: Iterable[Array], seconds: float) -> bool:
-    """Whether changes (M,) of two quantities that should go together are opposite for this time [s].
+def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], noise: tuple[Array, Array]) -> bool:
+    """Whether changes (M,) of two quantities that should go together are opposite for long enough.
 
-    Only instants count at which both changes exceed their limits (M,).
+    Only instants count at which both stand out of their noise, standard deviations (M,).
     """
     options = data.options
     with np.errstate(invalid="ignore"):
-        both = np.logical_and(*(np.abs(change) > limit for change, limit in zip(changes, limits, strict=True)))
+        both = np.logical_and(*(np.abs(c) > options.significant_sd * sd for c, sd in zip(changes, noise, strict=True)))
     both &= data.driving[len(data.driving) - len(both) :]
     a, b = (change[both] for change in changes)
-    product, n = a * b, max(round(seconds / data.bin), 1)
+    product, n = a * b, max(round(options.opposite_time / data.bin), 1)
     if np.count_nonzero(product < 0.0) < options.opposite_share * n:
         return False
     opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
