@@ -358,12 +358,32 @@ def _averaged(
     inflation = longer_side(fine - fine @ by_density, by_confidence)  # grows as the two distributions differ, too
     spread = inflation * (off * by_confidence) @ off.T
     covariance = np.tensordot(interpolation @ by_confidence, own, axes=1) + spread
+    mean[_K_C] = min(mean[_K_C], _greatest_k_c(mean, covariance, coordinates))
     soil, gains = coordinates.soil_at(mean[: len(free)]), gaussians[0].gains.copy()
     gains[active - _SOIL] = mean[len(free) :]
     by_coordinates = np.zeros((_SOIL + len(gains), len(mean)))
     by_coordinates[:_SOIL, : len(free)] = coordinates.log_directions(soil)
     by_coordinates[active, len(free) + np.arange(len(active))] = 1.0
     return Gaussian(soil, gains, by_coordinates @ covariance @ by_coordinates.T)
+
+
+def _greatest_k_c(mean: Array, covariance: Array, coordinates: Coordinates) -> float:
+    """Greatest log k_c at which log k_phi has no larger sd than its prior's; inf where there is none.
+
+    With the share s = k_c / (b K_L) and K_L = k_c / b + k_phi, d log k_phi = (d log K_L - s d log k_c) / (1 - s).
+    At a mode the prior of k_phi sees to it; means of k_c and of K_L apart can leave nothing for k_phi.
+    """
+    n, width = math.exp(mean[_N]), coordinates.width
+    by_coordinates = np.zeros((2, len(mean)))
+    by_coordinates[0, _K_C] = 1.0
+    by_coordinates[1, [_K_PHI, _N]] = 1.0, -n * coordinates.log_depth
+    (of_k_c, both), (_, of_K_L) = (by_coordinates @ covariance @ by_coordinates.T).tolist()
+    most = float(coordinates.prior.log_std[_K_PHI]) ** 2
+    if of_K_L >= most:
+        return math.inf
+    root = math.sqrt(max((both - most) ** 2 - (of_k_c - most) * (of_K_L - most), 0.0))
+    share = (of_K_L - most) / (both - most - root)
+    return math.log(share * width) + float(mean[_K_PHI]) - n * coordinates.log_depth
 
 
 def _in_coordinates(covariance: Array, directions: Array, free: Indices, active: Indices) -> Array:
