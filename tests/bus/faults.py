@@ -30,7 +30,7 @@ BABBLE = 2.0
 
 
 class Bus:
-    """Plays a recording, over and over, on whatever CHANNEL is; writes down what comes under our identifiers."""
+    """Plays a recording, over and over, on any CHANNEL; writes down what comes under our identifiers."""
 
     def __init__(self, recording: str, out: Path) -> None:
         self.frames = [parsed(line) for line in Path(recording).read_text().splitlines()]

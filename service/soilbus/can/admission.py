@@ -292,7 +292,7 @@ def _key(arbitration_id: int, extended: bool) -> int:
 
 
 def hears_any_source(message: Message, database: Database) -> bool:
-    """Whether a message counts by its parameter group, whatever the source address."""
+    """Whether a message counts by its parameter group, from any source address."""
     if not message.is_extended_frame or pgn_of(message.frame_id) not in STANDARD_PGNS:
         return False
     pgn = pgn_of(message.frame_id)

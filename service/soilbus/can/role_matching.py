@@ -105,7 +105,7 @@ _GROUPS: Mapping[int, frozenset[str]] = {
     65097: frozenset({"ground"}), 65265: frozenset({"wheel"}), 65267: frozenset({"position"}),
     127251: frozenset({"yaw"}), 129025: frozenset({"position"}),
 }  # fmt: skip
-"""What the standards say of a parameter group, whatever its signals are called."""
+"""What the standards say of a parameter group, with any names of its signals."""
 _ASKED = frozenset({"request", "least", "rated"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
 _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozenset[str]]] = {

@@ -6,7 +6,7 @@ Sensor gain errors and parameters of effects belong to the vehicle and are the s
 belongs to a recording, and so do the parameters of an effect of the record (see terra.effects.effect).  So recordings
 are fitted one after the other, each with the posterior of the previous ones as its prior, and then in turn again, each
 with the likelihood factors of all others in its prior, until all are at the same shared values: the optimum of all
-recordings together, whatever their order (expectation propagation by Laplace's method: Minka 2001, Proc. UAI 17:362).
+recordings together, in any order (expectation propagation by Laplace's method: Minka 2001, Proc. UAI 17:362).
 FittedModel.gap, the reduced chi-square of the held-out blocks, says how well the model predicts data that it was not
 fitted to.
 """

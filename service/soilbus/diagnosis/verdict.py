@@ -58,7 +58,7 @@ def verdict_of(
     chances
         Probability of each effect added.
     is_doubtful
-        Whether the names are not to be trusted whatever their probability: the effects explain the data only together
+        Whether the names are not to be trusted at any probability: the effects explain the data only together
         (`diagnose.shares_alone`), or the present model's fit did not converge, so that every fall from it is too large.
     """
     if is_unexplained(before, after, rows, options):

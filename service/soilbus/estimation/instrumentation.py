@@ -308,7 +308,7 @@ def _solved(rows: Sequence[Row], observed: Array) -> Array:
 
 
 def _combined(values: Array, weight: Array) -> Array:
-    """Weighted sums (N, W) of values (N, W); nan where a value with a weight is nan, whatever those without one are."""
+    """Weighted sums (N, W) of values (N, W); nan where a value with a weight is nan; those without one do not count."""
     unknown = np.isnan(values)
     sums = np.where(unknown, 0.0, values) @ weight.T
     if unknown.any():

@@ -117,7 +117,7 @@ class Refusals:
 
     @property
     def refused(self) -> int:
-        """Samples refused since the start, for whatever reason."""
+        """Samples refused since the start, for any reason."""
         return sum(self.total.values())
 
     def add(self, decoded: Decoded) -> None:

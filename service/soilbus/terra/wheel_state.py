@@ -33,7 +33,7 @@ class WheelModel:
     times it, s the slip where the wheel drives, and exit_angle [rad] more (0: the rut does
     not recover; behind the axle all are negative), but no farther behind than LONGEST times
     the entry angle.  exponential_share of the shear strength is mobilised by the exponential law
-    whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
+    under any shear_law.  From the depth pan_depth [m] on the pressure grows by
     pan_stiffness times what the soil alone would add (0: no hard pan).  A track's pressure has
     rollers periods along its contact (0: it is uniform).  one_off: a model whose shape no other
     call will share, so that nothing of it is kept.

@@ -157,7 +157,7 @@ def _flattened_forces(forces: Forces, state: WheelState, around: Surroundings, v
 
     The substitute circle ends at the axle.  Behind it, a share of the flat's half length
     carries the pressure of the deepest point and has slipped as far as the soil there; its
-    shear is Janosi and Hanamoto's whatever the model's law.
+    shear is Janosi and Hanamoto's under any law of the model.
     """
     circle, delta = state.radius, _deflection(state, around, values)
     z = sinkage(state.entry_angle, circle)

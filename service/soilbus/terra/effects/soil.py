@@ -18,7 +18,7 @@ REFERENCE_SPEED = 1.0
 TYPICAL_DEPTH = 0.05
 """Depth [m] at which a change of n with slip leaves the pressure as it is, so that the two parameters act apart."""
 TYPICAL_PRESSURE = 1e5
-"""Pressure [Pa] at which a change of n in ruts does: that of tyres, whatever the soil."""
+"""Pressure [Pa] at which a change of n in ruts does: that of tyres, on any soil."""
 _LEAST_SPEED = 0.05
 _LEAST_EXPONENT = 0.05
 _LEAST_CONTACT = 0.1  # of the sinkage: a wheel cannot throw away all of its ground
