@@ -336,7 +336,7 @@ class Wheel(_Section):
     torque_limit: Signal | None = None
     """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
-    """Only to find out a speed sensor that lies."""
+    """Only to find a faulty speed sensor."""
 
     _contact_length: float = PrivateAttr(0.0)
 
@@ -404,7 +404,7 @@ class Track(_Section):
     torque_limit: Signal | None = None
     """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
-    """Only to find out a speed sensor that lies."""
+    """Only to find a faulty speed sensor."""
 
     def as_wheel(self) -> Wheel:
         """The rigid wheel of the sprocket's radius that has its sensors, with the contact length."""

@@ -371,7 +371,7 @@ def _greatest_k_c(mean: Array, covariance: Array, coordinates: Coordinates) -> f
     """Greatest log k_c at which log k_phi has no larger sd than its prior's; inf where there is none.
 
     With the share s = k_c / (b K_L) and K_L = k_c / b + k_phi, d log k_phi = (d log K_L - s d log k_c) / (1 - s).
-    At a mode the prior of k_phi sees to it; means of k_c and of K_L apart can leave nothing for k_phi.
+    A fit contains the prior of k_phi; separate means of log k_c and log K_L do not, and may leave no k_phi at all.
     """
     n, width = math.exp(mean[_N]), coordinates.width
     by_coordinates = np.zeros((2, len(mean)))

@@ -44,6 +44,8 @@ Masked = tuple[Array, Array, NDArray[np.bool_]]
 
 GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 """Quantities with a gain error, in the order of `gain_names`."""
+MASS_GAIN = "load.weight"
+"""Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
@@ -61,10 +63,6 @@ _BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
 def gain_names(rig: Rig) -> list[str]:
     """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft."""
     return gains_of(rig)[0]
-
-
-MASS_GAIN = "load.weight"
-"""Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:

@@ -78,7 +78,7 @@ class ConsistencyInput(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """A window without the channels that lie in it, and which these are."""
+    """A window without the channels that contradict the others, and which these are."""
 
     window: Window
     implausible: tuple[str, ...]
@@ -105,7 +105,7 @@ class SensorConsistency:
                 heard.append(found)
 
     def checked(self, window: Window) -> Checked:
-        """A forward window (`window.forward`) without what lies in it."""
+        """A forward window (`window.forward`) without the channels that contradict the others."""
         s = self._settings
         names = implausible(
             window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, self._motor_speed(window)
@@ -151,7 +151,7 @@ def implausible(
     motor_speed: Array | None = None,
     options: ConsistencyOptions = CONSISTENCY,
 ) -> tuple[str, ...]:
-    """Channels of a forward window (see `window.forward`) that lie in it, in the order of rig.channels.
+    """Channels of a forward window (see `window.forward`) that contradict the others, in the order of rig.channels.
 
     min_speed [m/s] and max_turn as the estimator's gates; resolution by channel name;
     motor_speed [rad/s] (N, W), nan where unknown, may be named as "motor_speed.FL".

@@ -67,13 +67,13 @@ class ConsistencyOptions:
     sure_correlation: float = 0.985
     """Correlation [1] of the two at the best delay, at least; no evidence recorded."""
     possible_correlation: float = 0.9
-    """The same [1] at another delay that may be theirs; no evidence recorded."""
+    """Correlation [1] at another delay from which that delay is possible too; no evidence recorded."""
     known_share: float = 0.9
     """Share [1] of bins with both; no evidence recorded."""
     scale_ratio: float = 1.35
     """Ratio [1] of their changes from which they contradict each other; no evidence recorded."""
     max_delay: float = 0.6
-    """Time [s] by which the two may be late to each other; no evidence recorded."""
+    """Greatest delay [s] between speed and acceleration; no evidence recorded."""
     jump_explained: float = 0.25
     """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
     fifteen faults of the accelerometer are taken for jumps (`validation.sensitivity`)."""
