@@ -67,7 +67,7 @@ def in_process() -> Any:
         options = {"processes": False, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
         with (
             dask.config.set(quick),
-            distributed.LocalCluster(1, **options) as local,
+            distributed.LocalCluster(n_workers=1, **options) as local,
             distributed.Client(local, timeout=2) as client,
         ):
             yield local, client

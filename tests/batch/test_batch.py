@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import shutil
 from pathlib import Path
@@ -131,6 +132,45 @@ def test_the_summaries_count_what_the_windows_hold(done):
     assert (vehicles["frames.mapped"] > 0).all()
     counts = [name for name in logs.columns if name.startswith("rejected.")]
     assert vehicles[counts].sum().to_dict() == logs[counts].sum().to_dict()
+
+
+def test_a_long_log_is_handed_over_in_pieces(client, jobs, done, tmp_path):
+    batch = run_batch(client, jobs, tmp_path, of_piece=2)
+    table = {
+        out: pd.read_parquet(out / "windows").sort_values(["vehicle", "log", "t"], ignore_index=True)
+        for out in (done[1], tmp_path)
+    }
+    pd.testing.assert_frame_equal(table[tmp_path], table[done[1]])
+    assert len(list((tmp_path / "windows").rglob("*.parquet"))) > len(list((done[1] / "windows").rglob("*.parquet")))
+    for name in ("logs.parquet", "vehicles.parquet", "errors.parquet"):
+        assert (tmp_path / name).read_bytes() == (done[1] / name).read_bytes()
+    assert (batch.windows, batch.errors) == (done[0].windows, done[0].errors)
+    (left,) = client.run(lambda dask_worker: os.listdir(dask_worker.local_directory)).values()
+    assert left == ["storage"]  # of Dask
+
+
+class LosesWorkers:
+    """A client whose workers are gone when they are asked for what they keep."""
+
+    def __init__(self, client):
+        self.client = client
+
+    def __getattr__(self, name):
+        return getattr(self.client, name)
+
+    def run(self, function, *arguments, **options):
+        if "workers" in options:
+            raise OSError("Timed out trying to connect")
+        return self.client.run(function, *arguments, **options)
+
+
+def test_a_worker_lost_with_the_rest_of_a_log_is_an_error_of_this_run(client, jobs, done, tmp_path):
+    batch = run_batch(LosesWorkers(client), jobs, tmp_path, of_piece=2)
+    faults = [each["fault"] for each in batch.errors if "its worker was lost" in each["fault"]]
+    assert len(faults) == sum(summary["logs.all"] - summary["logs.failed"] for summary in done[0].vehicles)
+    assert not list((tmp_path / "parts").glob("*.gz"))
+    again = run_batch(client, jobs, tmp_path, of_piece=2)
+    assert (again.windows, again.errors) == (done[0].windows, done[0].errors)
 
 
 def test_a_stopped_batch_goes_on_to_the_same_bytes(client, jobs, done, tmp_path):

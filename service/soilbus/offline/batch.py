@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,17 @@ from soilbus.offline.fleet import (
     no_findings,
 )
 from soilbus.offline.jobs import BatchError, jobs_of
-from soilbus.offline.parts import Job, OtherVersion, Outcome, part_of, summary_of_part
+from soilbus.offline.parts import (
+    WINDOWS_OF_PIECE,
+    Job,
+    OtherVersion,
+    Outcome,
+    Rest,
+    part_of,
+    piece_left,
+    pieces_of_part,
+    summary_of_part,
+)
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
@@ -103,6 +113,10 @@ class Batch:
     stale_diagnosis: bool = False
 
 
+class WorkerLost(Exception):
+    """A worker is gone that kept something for us."""
+
+
 # --- Dask
 
 
@@ -141,7 +155,7 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
             options = {"threads_per_worker": 1, "processes": True, "silence_logs": logging.CRITICAL}
             here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
             with (
-                distributed.LocalCluster(processes, **options, **here) as local,
+                distributed.LocalCluster(n_workers=processes, **options, **here) as local,
                 distributed.Client(local) as client,
             ):
                 _announce(client, say)
@@ -307,6 +321,7 @@ def run_batch(
     progress: Callable[[str], None] = lambda _: None,
     diagnose: bool = False,
     retry: bool = False,
+    of_piece: int = WINDOWS_OF_PIECE,
 ) -> Batch:
     """Replay all logs that are not done yet, then write the results of all.
 
@@ -324,6 +339,8 @@ def run_batch(
         Whether to diagnose each vehicle over its logs, and the fleet.
     retry
         Whether to read logs that failed or were damaged again, and to diagnose vehicles again that lack a log.
+    of_piece
+        Windows of a log that are in memory at once, here and on the workers.
 
     Raises
     ------
@@ -336,7 +353,7 @@ def run_batch(
     """
     parts = out / "parts"
     kept = {digest: each for digest, each in _all_kept(jobs, parts).items() if not (retry and each.fault)}
-    outcomes = _replay_all(client, jobs, parts, kept, progress)
+    outcomes = _replay_all(client, jobs, parts, kept, progress, of_piece)
     of_logs: dict[str, Kept | Outcome] = {**kept, **outcomes}
     if jobs and sum(each.other_bus for each in of_logs.values()) == len(jobs):
         first = next(iter(of_logs.values())).fault
@@ -440,7 +457,12 @@ def _state_of(log: str) -> tuple[int | None, int | None]:
 
 
 def _replay_all(
-    client: Any, jobs: Sequence[Job], parts: Path, kept: Mapping[str, Kept], progress: Callable[[str], None]
+    client: Any,
+    jobs: Sequence[Job],
+    parts: Path,
+    kept: Mapping[str, Kept],
+    progress: Callable[[str], None],
+    of_piece: int,
 ) -> dict[str, Outcome]:
     """Outcomes, by digest, of the logs of which nothing is kept."""
     left = {job.digest: job for job in jobs if job.digest not in kept}
@@ -448,25 +470,45 @@ def _replay_all(
     states: dict[str, tuple[int | None, int | None]] = {}
     unseen = _unseen_folders(client, left.values())
 
-    def task(job: Job) -> tuple[Job, str]:
+    def task(job: Job) -> tuple[Job, str, int]:
         states[job.digest] = (None, None) if "://" in job.log else _state_of(job.log)
-        return _carrying(job, unseen), __version__
+        return _carrying(job, unseen), __version__, of_piece
 
     failed = 0
     for digest, result in done_in_turn(client, part_of, ((digest, task(job)) for digest, job in left.items())):
         outcome = _outcome(left[digest], result)
-        outcomes[digest] = replace(outcome, part=None)
         size, changed = states.pop(digest)
         if outcome.part is not None or outcome.lasting:
             size = outcome.log_bytes if size is None else size
             record = Kept(outcome.fault, outcome.windows, outcome.other_bus, size, changed)
-            dataset.put(_kept_path(parts, digest), json.dumps(asdict(record)).encode())
+            dataset.put(_kept_path(parts, digest), [json.dumps(asdict(record)).encode()])
         if outcome.part is not None:  # last: with it the log is done
-            dataset.put(_part_path(parts, digest), outcome.part)
+            try:
+                dataset.put(_part_path(parts, digest), _pieces(client, outcome.part, outcome.rest))
+            except WorkerLost:
+                fault = f"{left[digest].log}: its worker was lost before it handed over all windows"
+                outcome = Outcome(None, fault, cpu_seconds=outcome.cpu_seconds, log_bytes=outcome.log_bytes)
+        outcomes[digest] = replace(outcome, part=None)
         failed += outcome.part is None
         done = len(jobs) - len(left) + len(outcomes)
         progress(f"{done} of {len(jobs)} logs" + (f", {failed} failed" if failed else ""))
     return outcomes
+
+
+def _pieces(client: Any, first: bytes, rest: Rest | None) -> Iterator[bytes]:
+    """A part as it comes from its worker; WorkerLost.
+
+    Not as a task: it would wait until the log that is in work there is done.
+    """
+    yield first
+    if rest is None:
+        return
+    for begin, size in zip(accumulate(rest.sizes, initial=0), rest.sizes, strict=False):
+        try:
+            piece = client.run(piece_left, rest.path, begin, size, workers=[rest.worker])[rest.worker]
+        except Exception as error:  # of each protocol its own
+            raise WorkerLost from error
+        yield piece
 
 
 def _outcome(job: Job, result: Outcome | BaseException) -> Outcome:
@@ -525,14 +567,20 @@ def _write_windows(
         (out / "map.parquet").unlink(missing_ok=True)
         return
     columns = dataset.window_columns(summaries.values())
-    tasks = ((digest, (_part_path(out / "parts", digest).read_bytes(), columns)) for digest in summaries)
-    for n, (digest, files) in enumerate(done_in_turn(client, dataset.day_files, tasks), 1):
+    tasks = (
+        (f"{digest}-{n:03}", (piece, columns))
+        for digest, summary in summaries.items()
+        for n, piece in enumerate(pieces_of_part(_part_path(out / "parts", digest), summary["pieces"]))
+    )
+    pieces = sum(len(summary["pieces"]) for summary in summaries.values())
+    for done, (name, files) in enumerate(done_in_turn(client, dataset.day_files, tasks), 1):
+        digest = name.partition("-")[0]
         if isinstance(files, BaseException):
             part, why = _part_path(out / "parts", digest), one_line(Exception(str(files)), 100)
             raise BatchError(f"{part}: cannot be converted ({why}): delete it, and --resume reads its log again")
         for day, content in files.items():
-            dataset.put(dataset.folder_of(new, vehicles[digest], day) / f"{digest}.parquet", content)
-        progress(f"tables of {n} of {len(summaries)} logs")
+            dataset.put(dataset.folder_of(new, vehicles[digest], day) / f"{name}.parquet", [content])
+        progress(f"tables: {done} of {pieces}")
     dataset.replace_folder(new, windows)
     progress("map")
     dataset.write_map(out / "map.parquet", windows)
@@ -560,7 +608,7 @@ def _diagnose_all(
         for vehicles in types.values()
     ]
     fleet = judged([of_type for of_type, _ in found], [each for _, findings in found for each in findings])
-    dataset.put(out / OF_DIAGNOSIS[0], (json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode())
+    dataset.put(out / OF_DIAGNOSIS[0], [(json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode()])
     dataset.write_rows(out / OF_DIAGNOSIS[1], effect_rows(fleet), dataset.EFFECT_COLUMNS)
     return fleet
 
@@ -586,7 +634,7 @@ def _diagnosed(
         if isinstance(findings, BaseException):
             fault = f"{one_line(Exception(str(findings)), 200)} ({type(findings).__name__})"
             findings = no_findings(vehicles[left[digest]][0].vehicle, fault)
-        dataset.put(kept[left[digest]], json.dumps(known(findings), indent=1, allow_nan=False).encode())
+        dataset.put(kept[left[digest]], [json.dumps(known(findings), indent=1, allow_nan=False).encode()])
         beside = f" beside {', '.join(given[0])}" if given[0] else ""
         progress(f"{n} of {len(left)} vehicles diagnosed{beside}")
     return [json.loads(path.read_bytes()) for path in kept]

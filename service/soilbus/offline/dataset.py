@@ -1,6 +1,6 @@
 """The parts of a batch -> its results: windows by vehicle and day, summaries, errors, map.
 
-    windows/vehicle=V/day=D/DIGEST.parquet      rows of one log on one day (UTC), the same columns in every file
+    windows/vehicle=V/day=D/DIGEST-N.parquet    rows of a piece of one log on one day (UTC), with the same columns
     logs.parquet, vehicles.parquet              counts and means; a row for each log, for each vehicle
     errors.parquet                              logs that failed or were damaged, each with its line
     map.parquet                                 GeoParquet 1.1: a point (WKB, WGS84) for each window with a position
@@ -23,7 +23,7 @@ import numpy as np
 
 from soilbus.export.table import arrow_schema, arrow_table, table_columns
 from soilbus.files import whole_file_of_bytes
-from soilbus.offline.parts import rows_of_part
+from soilbus.offline.parts import rows_of_piece
 from soilbus.pipeline.outputs import column_names
 
 ROW_GROUP = 2000
@@ -57,13 +57,13 @@ GEO = {
 _WKB_POINT = np.dtype([("order", "u1"), ("kind", "<u4"), ("x", "<f8"), ("y", "<f8")])
 
 
-def day_files(part: bytes, columns: Sequence[str]) -> dict[str, bytes]:
-    """Parquet files of one part, by day.
+def day_files(piece: bytes, columns: Sequence[str]) -> dict[str, bytes]:
+    """Parquet files of a piece of a part, by day.
 
     Parameters
     ----------
-    part
-        As parts.part_of() makes it.
+    piece
+        As parts.pieces_of_part() reads it.
     columns
         Of all windows of the batch.
     """
@@ -72,7 +72,7 @@ def day_files(part: bytes, columns: Sequence[str]) -> dict[str, bytes]:
     schema = arrow_schema(columns)
     files: dict[str, BytesIO] = {}
     writers: dict[str, Any] = {}
-    for rows in rows_of_part(part, ROW_GROUP):
+    for rows in rows_of_piece(piece, ROW_GROUP):
         days = [_day(row["time"]) for row in rows]
         for day in dict.fromkeys(days):
             if day not in writers:
@@ -107,11 +107,11 @@ def _vehicle_folder(vehicle: str) -> str:
     return f"vehicle={quote(vehicle, safe=' ')}"
 
 
-def put(path: Path, content: bytes) -> None:
+def put(path: Path, content: Iterable[bytes]) -> None:
     """A file that is there whole or not at all, in a folder that may have to be made; NotWritten."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file_of_bytes(path) as out:
-        out.write(content)
+        out.writelines(content)
 
 
 def replace_folder(new: Path, old: Path) -> None:
@@ -127,12 +127,14 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[
 
     out = BytesIO()
     pq.write_table(arrow_table(rows, arrow_schema(columns or table_columns(rows))), out)
-    put(path, out.getvalue())
+    put(path, [out.getvalue()])
 
 
 def log_rows(summaries: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of logs.parquet: the summaries; a reason of refusal that a log does not have was counted 0 times."""
-    rows = [{name: value for name, value in summary.items() if name != "columns"} for summary in summaries]
+    rows = [
+        {name: value for name, value in summary.items() if name not in ("columns", "pieces")} for summary in summaries
+    ]
     reasons = sorted({name for row in rows for name in row if name.startswith("rejected.")})
     return [row | {reason: row.get(reason, 0) for reason in reasons} for row in rows]
 

@@ -1,10 +1,10 @@
 """One log of a batch -> its part: all of its windows and a summary, whole or not at all.
 
-    log -> replay -> part = gzip(summary) + gzip(a line of JSON for each window)
+    log -> replay -> part = gzip(summary) + pieces, each gzip(a line of JSON for each of 10 000 windows)
 
 A part depends on the log, the configuration and the version of soilbus alone: the same log gives the same bytes on
-every machine.  The replay yields one window at a time and its line goes to a temporary file, so memory does not grow
-with the log; at the end the part is in memory as a whole, about 1 kB a window.
+every machine.  The replay yields one window at a time and its line goes to a temporary file; of a part no more than a
+piece is in memory, here or where it is asked for.  So memory does not grow with the log.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ import pickle
 import stat
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import SEEK_END, BytesIO
-from itertools import islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
+from shutil import copyfileobj
+from tempfile import NamedTemporaryFile, TemporaryDirectory, TemporaryFile
 from typing import IO, Any
 
 from cantools.database.can import Database
@@ -44,6 +45,8 @@ from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.words import one_line
 
 MISSING = "no such file"
+WINDOWS_OF_PIECE = 10_000
+"""10 MB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +103,22 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
+class Rest:
+    """What a worker keeps of a part until it is asked for: its address, the file, the sizes of the pieces [bytes]."""
+
+    worker: str
+    path: str
+    sizes: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What came of a log.
 
     Attributes
     ----------
     part
-        None where there is none.
+        Its summary and first piece; None where there is none.
     fault
         Why the log was not read, or not to its end, in one line; None where it was.
     windows
@@ -117,6 +129,8 @@ class Outcome:
         Whether the fault is of what is in the log, so that the same file has it again; else of the place or machine.
     cpu_seconds, log_bytes
         Cost: processor time, size of the log.
+    rest
+        The other pieces; None where there are no others.
     """
 
     part: bytes | None
@@ -126,6 +140,7 @@ class Outcome:
     lasting: bool = False
     cpu_seconds: float = 0.0
     log_bytes: int = 0
+    rest: Rest | None = None
 
 
 class OtherVersion(Exception):
@@ -212,7 +227,7 @@ def unpacked(content: bytes) -> tuple[Config, Database | None]:
     return config, database
 
 
-def part_of(job: Job, version: str) -> Outcome:
+def part_of(job: Job, version: str, of_piece: int = WINDOWS_OF_PIECE) -> Outcome:
     """Replay one log; its fault, if it has one, is in the outcome.
 
     Parameters
@@ -221,6 +236,8 @@ def part_of(job: Job, version: str) -> Outcome:
         The log.
     version
         Of the soilbus that asks for it.
+    of_piece
+        Windows of a piece: no more are in memory at once.
 
     Raises
     ------
@@ -234,7 +251,7 @@ def part_of(job: Job, version: str) -> Outcome:
             _check_is_file(path)
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
-            outcome = _replayed(job, path)
+            outcome = _replayed(job, path, of_piece)
     except LogError as error:
         return Outcome(None, str(error))
     except MemoryError:
@@ -281,36 +298,68 @@ def local_log(job: Job) -> Iterator[Path]:
         yield path
 
 
-def _replayed(job: Job, path: Path) -> Outcome:
+def _replayed(job: Job, path: Path, of_piece: int) -> Outcome:
     config, database = unpacked(job.setup.content)
     with TemporaryFile() as lines:
-        return _part_by_way_of(lines, job, config, database, path)
+        return _part_by_way_of(lines, job, config, database, path, of_piece)
 
 
-def _part_by_way_of(lines: IO[bytes], job: Job, config: Config, database: Database | None, path: Path) -> Outcome:
-    """The outcome; `lines` is an empty file that holds the windows until the summary, which goes before, is known."""
+def _part_by_way_of(
+    lines: IO[bytes], job: Job, config: Config, database: Database | None, path: Path, of_piece: int
+) -> Outcome:
+    """The outcome; `lines` is an empty file that holds the pieces until the summary, which goes before, is known."""
     summary = _Summary(job, config)
     fault: LogError | None = None
-    with gzip.GzipFile(filename="", fileobj=lines, mode="wb", mtime=0) as out:
-        pipeline = None if database is None else Pipeline(config, database)
+    pipeline = None if database is None else Pipeline(config, database)
+
+    def written() -> Iterator[bytes]:
+        nonlocal fault
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
                 run = (result.log or "").removeprefix(path.name) if pipeline is None else ""  # of a table: its soil bed
                 row = summary.row(replace(result, log=job.log + run))
-                out.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+                yield json.dumps(row, allow_nan=False).encode() + b"\n"
         except LogError as error:
             fault = error
+
+    windows, ends = written(), [0]
+    while (first := next(windows, None)) is not None:
+        with gzip.GzipFile(filename="", fileobj=lines, mode="wb", mtime=0) as piece:
+            piece.writelines(chain([first], islice(windows, of_piece - 1)))
+        ends.append(lines.tell())
     text = None if fault is None else str(fault).replace(str(path), job.log)
     if fault is not None and not summary.windows:
         return Outcome(None, text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting)
     if not summary.windows:
         text = f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window"
         return Outcome(None, text, lasting=True)
-    head = json.dumps(summary.record(pipeline, text), allow_nan=False).encode() + b"\n"
+    sizes = tuple(end - begin for begin, end in pairwise(ends))
+    record = {**summary.record(pipeline, text), "pieces": sizes}
     lines.seek(0)
-    return Outcome(
-        b"".join((gzip.compress(head, mtime=0), lines.read())), text, summary.windows, lasting=fault is not None
-    )
+    part = gzip.compress(json.dumps(record, allow_nan=False).encode() + b"\n", mtime=0) + lines.read(sizes[0])
+    rest = _left_here(lines, sizes[1:]) if sizes[1:] else None
+    return Outcome(part, text, summary.windows, lasting=fault is not None, rest=rest)
+
+
+def _left_here(lines: IO[bytes], sizes: tuple[int, ...]) -> Rest:
+    """The rest of a file, in the folder of the Dask worker that this runs on; it goes with the worker."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    with NamedTemporaryFile(dir=worker.local_directory, delete=False) as file:
+        copyfileobj(lines, file)
+    return Rest(worker.address, file.name, sizes)
+
+
+def piece_left(path: str, begin: int, size: int) -> bytes:
+    """A piece of a part that was left on a worker; with the last one its file goes."""
+    with open(path, "rb") as file:
+        file.seek(begin)
+        piece = file.read(size)
+        is_last = file.tell() == file.seek(0, SEEK_END)
+    if is_last:
+        os.unlink(path)
+    return piece
 
 
 class _Summary:
@@ -322,7 +371,7 @@ class _Summary:
         self._shift: float | None = None
         self._columns: dict[str, None] = {}
         self._counts: Counter[str] = Counter()
-        self._bearing: list[float] = []
+        self._bearing_sum, self._bearing_n = 0.0, 0
         self._rejected: Counter[str] = Counter()
         self._times: list[int] = []
         self._newest = -math.inf
@@ -343,7 +392,8 @@ class _Summary:
         self._counts[f"windows.{result.status}"] += 1
         self._counts[f"windows.{result.traversability.state}"] += 1
         if result.bearing is not None and result.status is Status.VALID:
-            self._bearing.append(result.bearing.value)
+            self._bearing_sum += result.bearing.value
+            self._bearing_n += 1
         if self.config.table is not None:
             self._rejected += Counter(result.rejected)
         self._times = [self._times[0] if self._times else when, when] if when is not None else self._times
@@ -369,7 +419,6 @@ class _Summary:
                 "frames.lost": pipeline.admission.missed,
             }
             used, rejected = refusals.used, refusals.total
-        n = len(self._bearing)
         return {
             "vehicle": self.job.vehicle,
             "log": self.job.log,
@@ -379,7 +428,7 @@ class _Summary:
             "duration": self._duration,
             "windows.all": self.windows,
             **{f"windows.{each}": self._counts[f"windows.{each}"] for each in (*Status, *State)},
-            "bearing_pressure.mean": math.fsum(self._bearing) / n if n else None,
+            "bearing_pressure.mean": self._bearing_sum / self._bearing_n if self._bearing_n else None,
             **frames,
             "samples": used,
             **{f"rejected.{reason}": n for reason, n in sorted(rejected.items())},
@@ -393,10 +442,11 @@ def summary_of_part(path: Path) -> dict[str, Any] | None:
     try:
         with gzip.open(path) as lines:
             summary: dict[str, Any] = json.loads(next(lines))
-    except (OSError, EOFError, StopIteration, ValueError):
+        is_whole = path.stat().st_size > sum(summary["pieces"])
+    except (OSError, EOFError, StopIteration, ValueError, KeyError):
         return None
     summary["columns"] = _shared(tuple(summary["columns"]))
-    return summary
+    return summary if is_whole else None
 
 
 @lru_cache(maxsize=256)
@@ -405,9 +455,16 @@ def _shared(columns: tuple[str, ...]) -> tuple[str, ...]:
     return columns
 
 
-def rows_of_part(part: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
-    """The windows of a part as rows of a table, `at_once` or fewer at a time."""
-    with gzip.GzipFile(fileobj=BytesIO(part)) as lines:
-        next(lines)
+def pieces_of_part(path: Path, sizes: Sequence[int]) -> Iterator[bytes]:
+    """The windows of a part, as pieces of the sizes that its summary says."""
+    with path.open("rb") as file:
+        file.seek(-sum(sizes), SEEK_END)
+        for size in sizes:
+            yield file.read(size)
+
+
+def rows_of_piece(piece: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
+    """The windows of a piece as rows of a table, `at_once` or fewer at a time."""
+    with gzip.GzipFile(fileobj=BytesIO(piece)) as lines:
         while rows := [json.loads(line) for line in islice(lines, at_once)]:
             yield rows
