@@ -54,7 +54,7 @@ class DelayPosterior(NamedTuple):
 def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float) -> FittedModel:
     """A fitted model that reports delays by their joint posteriors.
 
-    Fitted again from the best delays where these lower -2 log posterior by more than `delay_refit_fall`.
+    Fitted again from the best delays where these lower -2 log posterior by more than `negligible_fall`.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
         The temperature.
     """
     found = delay_posteriors(records, prior, fitted, divisor)
-    if any(posterior.fall > records[0].options.delay_refit_fall * divisor for posterior in found.values()):
+    if any(posterior.fall > records[0].options.negligible_fall * divisor for posterior in found.values()):
         better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
         if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
             fitted, found = better, delay_posteriors(records, prior, better, divisor)

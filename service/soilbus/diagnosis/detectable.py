@@ -142,7 +142,7 @@ def _sampling_delay(effect: Effect, record: Record) -> float:
 def _max_size(parameter: Parameter, options: DiagnosisOptions) -> float:
     """The largest plausible size."""
     widest = max(parameter.high - parameter.neutral, parameter.neutral - parameter.low)
-    return min(options.max_plausible_sd * parameter.std, widest)
+    return min(options.plausible_sd * parameter.std, widest)
 
 
 def _least_size(information: Array, index: int, free: Sequence[Free], required: float, largest: float) -> float:

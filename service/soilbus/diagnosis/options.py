@@ -28,7 +28,7 @@ class DiagnosisOptions:
     """Reduced chi-square [1] of one fold beyond which its noise does not matter, and no other fold is held out."""
 
     max_effects: int = 3
-    """Effects that are added at most; no evidence recorded."""
+    """Effects that are added at most, and residual terms of a channel; no evidence recorded."""
     max_candidates: int = 6
     """Candidates that a comparison fits, the best by their scores: of 82 single effects of the blind seeds 211 and 212
     the hidden one is among the first three of 77, and of the others behind the thirteenth."""
@@ -38,8 +38,9 @@ class DiagnosisOptions:
     """Descent of fits that are compared by their objective: 0.02 of -2 log decides nothing."""
     negligible_fall: float = 1.0
     """Fall of -2 log posterior or evidence up to which two models are equally good: odds of e^0.5."""
-    max_start_sd: float = 2.0
-    """How far a start's parameters may be from neutral [prior sd], as the model is linear near the fit only."""
+    plausible_sd: float = 2.0
+    """How far from neutral an effect's parameter is plausible, and a start of it is [prior sd]: a normal variable is
+    farther in one case of twenty."""
     check_rounds: int = 3
     """Linearisations that bring the latents of held-out blocks to their optimum; no evidence recorded."""
 
@@ -87,13 +88,6 @@ class DiagnosisOptions:
     min_variance_share: float = 0.01
     """Share [1] of a gain's prior variance that the data must determine for its error to be tested; no evidence
     recorded."""
-    max_plausible_sd: float = 2.0
-    """Size up to which an effect is plausible [prior sd]: a normal variable exceeds it in one of twenty."""
-    max_terms: int = 3
-    """Residual terms of a channel; no evidence recorded."""
-    min_explained_share: float = 0.1
-    """Share [1] of a channel's held-out excess chi-square that a description must explain to be reported; no evidence
-    recorded."""
 
     delay_step: float = 0.005
     """Half the span of sums [s] that a parabola goes through; no evidence recorded."""
@@ -106,9 +100,6 @@ class DiagnosisOptions:
     delay_sure_sd: float = 5.0
     """Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the
     pitch of a simulated drive is late that is not."""
-    delay_refit_fall: float = 2.0
-    """Fall of the tempered -2 log posterior along a ridge from which the model is fitted again from there; no evidence
-    recorded."""
 
 
 @dataclass(frozen=True, slots=True)

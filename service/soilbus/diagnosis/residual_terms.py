@@ -65,7 +65,7 @@ def residual_terms(records: Sequence[Record], fitted: FittedModel) -> list[Resid
             continue
         terms = _selected(training, options)
         explained = _explained(held_out, terms)
-        if terms and explained > options.min_explained_share:
+        if terms and explained > 0.0:
             found.append(ResidualTerms(channel, wheel, tuple(terms), explained))
     return sorted(found, key=lambda description: -description.explained)
 
@@ -127,7 +127,7 @@ def _selected(sample: _Sample, options: DiagnosisOptions) -> list[Term]:
     """Terms by forward selection while BIC, with the choice among candidates counted, falls."""
     chosen: list[str] = []
     chi2, n = float(sample.z @ sample.z), len(sample.z)
-    while len(chosen) < options.max_terms and n > options.where_residuals:
+    while len(chosen) < options.max_effects and n > options.where_residuals:
         trials = {name: _chi2_after(sample, [*chosen, name]) for name in sample.regressors if name not in chosen}
         best = min(trials, key=lambda name: trials[name])
         if chi2 - trials[best] < 2.0 * math.log(n) + 2.0 * math.log(len(trials)):

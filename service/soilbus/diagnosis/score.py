@@ -56,7 +56,7 @@ class NormalEquations:
 
     gradient (P,) and information (P, P) are of the data alone, without the parameters' prior.  response (C, P) is
     H_cc^-1 H_cu: the present coordinates follow a step u by -response u.  fitted is the present model.
-    is_own (C,): which present coordinates belong to this recording alone.  max_start_sd: see DiagnosisOptions.
+    is_own (C,): which present coordinates belong to this recording alone.  plausible_sd: see DiagnosisOptions.
     """
 
     objective: Objective
@@ -68,7 +68,7 @@ class NormalEquations:
     response: Array
     held_out_latents: Latents
     fitted: FittedModel
-    max_start_sd: float
+    plausible_sd: float
 
     @property
     def shared_gains(self) -> NDArray[np.intp]:
@@ -294,7 +294,7 @@ def _reduced(
         response,
         held_out,
         present,
-        record.options.max_start_sd,
+        record.options.plausible_sd,
     )
 
 
@@ -360,11 +360,11 @@ def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) 
 def _start(
     equations: NormalEquations, columns: NDArray[np.intp], step: Array, offset: Array | float, by_u: Array
 ) -> Start:
-    """Where a fit of one recording with the effect begins: at the step (P,), shortened to `max_start_sd`.
+    """Where a fit of one recording with the effect begins: at the step (P,), shortened to `plausible_sd`.
 
     offset (C,) and by_u (C, P): what the present coordinates change by, and by each of all parameters.
     """
-    share = min(1.0, equations.max_start_sd / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    share = min(1.0, equations.plausible_sd / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     step = share * step
     follow = offset + by_u[:, columns] @ step
     objective, iterate = equations.objective, equations.iterate

@@ -249,7 +249,6 @@ def fit_from(
             first = replace(
                 search.soil_alone,
                 max_evaluations=options.max_evaluations // 2,
-                give_up_above=search.as_measured_ratio * options.give_up_above,
             )
             near = minimise(as_measured, as_measured.start(start.soil, gains=gains), first)
             if near.termination in (Termination.GIVEN_UP, Termination.NOT_FINITE):
@@ -369,7 +368,7 @@ def _search(thin: Objective) -> list[_End]:
         end = _end_from(thin, np.asarray(start))
         if end is None:
             continue
-        met = any(abs(end.value - other.value) < options.same_end_ratio * other.value for other in ends)
+        met = any(abs(end.value - other.value) < options.soil_alone.decrease_tolerance * other.value for other in ends)
         ends.append(end)
         if met and end.value < options.plausible_chi2 * thin.problem.n_rows:
             break

@@ -75,24 +75,22 @@ class SearchOptions:
     """Instants of a window that the search for starts uses; no evidence recorded."""
     start_prior_sd: float = 2.0
     """How far a start may be from the prior's median [prior sd]; with 4, the bounds, border windows end elsewhere."""
-    same_end_ratio: float = 0.02
-    """Relative difference of two objectives [1] below which two descents have met; no evidence recorded."""
     plausible_chi2: float = 3.0
     """Objective per residual [1] up to which an optimum of the search may be the soil's; no evidence recorded."""
     implausible: float = 60.0
     """Objective per thinned instant [-2 log] above which a window cannot be of one soil.  Without this limit the
     budget of a border's search is gone before another soil is found."""
     max_implausible_evaluations: int = 5
-    """Evaluations from an end whose objective exceeds `implausible`; no evidence recorded."""
-    as_measured_ratio: float = 2.5
-    """The objective with latents as measured over that at the optimum [1], at most; no evidence recorded."""
+    """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
+    `replay-bogging` gets an estimate."""
     determined_k_c_sd: float = 0.6
     """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it; no
     evidence recorded."""
     other_optimum_sd: float = 10.0
     """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum; no evidence recorded."""
     distinct_sd: float = 2.0
-    """Mahalanobis distance [sd] of two optima from which they are two modes; no evidence recorded."""
+    """Mahalanobis distance [sd] of two optima from which they are two modes, and difference of their bearing pressure
+    or tan phi [sd] from which a window is ambiguous; no evidence recorded."""
     min_mode_share: float = 0.05
     """Share of the probability [1] below which a second mode does not count; no evidence recorded."""
     typical_depth: float = 0.03

@@ -40,7 +40,13 @@ from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, refit_denoised, warm_start
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, ObservationModelWithEffects, Work
+from soilbus.estimation.observation_model import (
+    RESIDUAL,
+    TIME_TOLERANCE,
+    ObservationModel,
+    ObservationModelWithEffects,
+    Work,
+)
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.path_curvature import (
     curvature_of,
@@ -73,8 +79,6 @@ __all__ = [
     "next_state",
 ]
 
-TIME_TOLERANCE = 1e-3
-"""Times [s] closer than this are the same."""
 _SOIL = len(PARAMETERS)
 
 

@@ -1,6 +1,6 @@
 """One log of a batch -> its part: all of its windows and a summary, whole or not at all.
 
-    log -> replay -> part = gzip(summary) + pieces, each gzip(a line of JSON for each of 10 000 windows)
+    log -> replay -> part = gzip(summary) + pieces, each gzip(a line of JSON for each of 5000 windows)
 
 A part depends on the log, the configuration and the version of soilbus alone: the same log gives the same bytes on
 every machine.  The replay yields one window at a time and its line goes to a temporary file; of a part no more than a
@@ -45,8 +45,8 @@ from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.words import one_line
 
 MISSING = "no such file"
-WINDOWS_OF_PIECE = 10_000
-"""10 MB."""
+WINDOWS_OF_PIECE = 5_000
+"""5 MB: of 10 MB Dask warns.  A log of an hour is one piece."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,10 +52,6 @@ from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 
-AMBIGUITY_SD = 2.0
-"""Difference of bearing pressure or tan phi at a second mode, in standard deviations, from which a window is
-ambiguous.  No evidence recorded."""
-
 
 @dataclass(frozen=True, slots=True)
 class Undecided:
@@ -390,12 +386,13 @@ class WindowEstimator:
         return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
 
     def _ambiguous(self, fit: Fit) -> bool:
-        """Whether a second mode has a bearing pressure or tan phi more than AMBIGUITY_SD from the first."""
+        """Whether a second mode has a bearing pressure or tan phi more than `distinct_sd` from the first."""
         if fit.second_mode is None:
             return False
         one, other = fit.mode.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
-        return any(abs(a.value - b.value) > AMBIGUITY_SD * a.std for a, b in pairs)
+        distinct_sd = self.rig.options.search.distinct_sd
+        return any(abs(a.value - b.value) > distinct_sd * a.std for a, b in pairs)
 
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:
