@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -18,6 +19,9 @@ from availability import unavailable
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/test_demo.py")
 """What waits for a bus, a guest kernel or a service most of the time."""
+
+
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # below nohup it is ignored, also by the processes that tests start
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -102,8 +102,8 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
     Returns
     -------
     Fit
-        With the denoised window's Gaussian unless there is a second mode, and with `marginalised` where there is
-        something to average; `found` itself where neither is.
+        With `marginalised`, and with the denoised window's Gaussians unless there is a second mode; `found` itself
+        where there is nothing to average.
     """
     options = problem.options.posterior
     sd_of_n = _sd_of_n(problem, prior, joint_prior, found.mode)
@@ -116,15 +116,23 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
             return found
         coordinates = coordinates_of(problem, prior)
         attainable = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
-        averaged = None
+        averaged = along.top.mode
         if attainable is not None:
             averaged = _averaged(along.nodes, attainable, coordinates, joint_prior, options)
-    reported = along.top.mode if averaged is None else averaged
-    if not (np.isfinite(reported.soil).all() and np.isfinite(reported.covariance).all()):
-        return found
-    if found.second_mode is not None:  # the first stays as it was found
-        return replace(found, marginalised=reported)
-    return replace(found, mode=along.top.mode, marginalised=averaged)
+    is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
+    if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
+        return replace(found, marginalised=averaged) if is_finite else found
+    is_gaussian = _agree(along.top.mode, averaged, options)
+    return replace(found, mode=along.top.mode, marginalised=averaged, is_gaussian=is_gaussian)
+
+
+def _agree(mode: Gaussian, averaged: Gaussian, options: PosteriorOptions) -> bool:
+    """Whether the average along n is near to the Gaussian at the mode and hardly wider."""
+    free = np.flatnonzero(np.diag(mode.covariance) > 0.0)
+    own, wide = (b.covariance[np.ix_(free, free)] for b in (mode, averaged))
+    widening = np.linalg.eigvals(np.linalg.solve(own, wide)).real
+    shift = mode.posterior.distance(averaged.posterior.soil)
+    return bool(shift < options.gaussian_shift_sd and widening.max() < options.gaussian_widening**2)
 
 
 def _sd_of_n(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, mode: Gaussian) -> float:

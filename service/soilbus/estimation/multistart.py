@@ -114,6 +114,8 @@ class Fit:
         Whether sinkages and the other measurements agree on no soil (see `tracker.sinkages_off_scale`).
     form
         What the model's form leaves open (`model_form`).
+    is_gaussian
+        Whether one mode describes the posterior; only then can it be the prior of later windows.
     """
 
     mode: Gaussian
@@ -129,11 +131,7 @@ class Fit:
     curved_path: CurvedPathFit | None = None
     off_scale: bool = False
     form: FormPosterior | None = None
-
-    @property
-    def is_gaussian(self) -> bool:
-        """Whether mode and curvature describe the posterior; only then are they a prior of later windows."""
-        return self.marginalised is None and self.second_mode is None
+    is_gaussian: bool = True
 
     @property
     def posterior(self) -> Posterior:
@@ -423,7 +421,7 @@ def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: S
     is_distinct = better.mode.posterior.distance(worse.mode.posterior.soil) >= options.distinct_sd
     if share < options.min_mode_share or not is_distinct:
         return better
-    return replace(better, second_mode=SecondMode(worse.mode, share))
+    return replace(better, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
 
 
 def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:

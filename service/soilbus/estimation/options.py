@@ -120,7 +120,7 @@ class PosteriorOptions:
     """What a fit's posterior is: moments, average along n, drift, path curvature, form, soil classes."""
 
     determined_n_sd: float = 0.05
-    """Sd of log n [1] below which a posterior with one mode is Gaussian; no evidence recorded."""
+    """Sd of log n [1] below which a posterior with one mode counts as Gaussian; no evidence recorded."""
     min_load_signal: float = 4.0
     """Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1
     all of it is noise, at 4 a quarter is."""
@@ -135,6 +135,11 @@ class PosteriorOptions:
     least in units of what is attainable on each soil, with 0 that of the logarithm."""
     error_power_of_k_c: float = 2.0
     """The same [1] for k_c."""
+    gaussian_shift_sd: float = 0.5
+    """How far the average along n may be from the mode's [sd] for a posterior to count as Gaussian; no evidence
+    recorded."""
+    gaussian_widening: float = 1.2
+    """How much wider [1] it may be; no evidence recorded."""
     drift_pieces: int = 5
     """Pieces of a window, each with its own soil; no evidence recorded."""
     steady_drift_sd: float = 7.0
