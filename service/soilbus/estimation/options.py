@@ -107,7 +107,8 @@ class SearchOptions:
     soil_alone: SolverOptions = SolverOptions(
         10, step_tolerance=1.0, decrease_tolerance=0.02, damping=1e-3, max_rise=0.0
     )
-    """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
+    """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on.  Two
+    ends whose objectives differ by less than its `decrease_tolerance` are one."""
     cold: SolverOptions = SolverOptions()
     """Joint descent of soil, gains and latents from there."""
     warm: SolverOptions = SolverOptions(step_tolerance=2e-4)

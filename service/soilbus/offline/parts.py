@@ -46,7 +46,8 @@ from soilbus.words import one_line
 
 MISSING = "no such file"
 WINDOWS_OF_PIECE = 5_000
-"""5 MB: of 10 MB Dask warns.  A log of an hour is one piece."""
+"""Windows of a log that are handed over at once; 1 kB each.  Of messages of 10 MB Dask warns; a log of an hour, with
+a window every second, is one piece."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +252,8 @@ def part_of(job: Job, version: str, of_piece: int = WINDOWS_OF_PIECE) -> Outcome
             _check_is_file(path)
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
-            outcome = _replayed(job, path, of_piece)
+            with TemporaryFile() as lines:
+                outcome = _replayed(lines, job, path, of_piece)
     except LogError as error:
         return Outcome(None, str(error))
     except MemoryError:
@@ -298,16 +300,9 @@ def local_log(job: Job) -> Iterator[Path]:
         yield path
 
 
-def _replayed(job: Job, path: Path, of_piece: int) -> Outcome:
-    config, database = unpacked(job.setup.content)
-    with TemporaryFile() as lines:
-        return _part_by_way_of(lines, job, config, database, path, of_piece)
-
-
-def _part_by_way_of(
-    lines: IO[bytes], job: Job, config: Config, database: Database | None, path: Path, of_piece: int
-) -> Outcome:
+def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int) -> Outcome:
     """The outcome; `lines` is an empty file that holds the pieces until the summary, which goes before, is known."""
+    config, database = unpacked(job.setup.content)
     summary = _Summary(job, config)
     fault: LogError | None = None
     pipeline = None if database is None else Pipeline(config, database)

@@ -1,8 +1,8 @@
 """Memory that a batch takes for one long log: it does not grow with the log.
 
-    python -m soilbus.validation.long_log [--gigabytes 1] [--hop 1]
+    python -m soilbus.validation.long_log [--gigabytes 1] [--hop 1] [--stretch 600]
 
-A simulated log of ten minutes is written again and again, each time later, until the file is as large as asked for.
+A simulated log (of ten minutes) is written again and again, each time later, until the file is as large as asked for.
 One worker replays it as `soilbus batch` does.  The resident memory of the worker and of the process that asks is
 printed at each tenth of the log and at the end, with the peaks.
 """
@@ -26,17 +26,12 @@ from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 
-STRETCH = 600.0
-"""Seconds of the simulated log."""
-SAMPLED_EVERY = 1.0
-"""Seconds between two looks at the memory."""
 
-
-def long_log(path: Path, size: float) -> float:
-    """Write a candump log of `size` bytes; its duration [s]."""
+def long_log(path: Path, size: float, seconds: float) -> float:
+    """Write a candump log of `size` bytes, a drive of `seconds` again and again; its duration [s]."""
     config = reference_configuration()
     stretch = path.with_suffix(".stretch.log")
-    write_log(frames(simulate(config, scenario_over(["loam"], STRETCH), seed=1), config), stretch)
+    write_log(frames(simulate(config, scenario_over(["loam"], seconds), seed=1), config), stretch)
     lines = [(float(stamp[1:]), rest) for stamp, rest in (line.split(b")", 1) for line in stretch.open("rb"))]
     begin, end = lines[0][0], lines[-1][0]
     later, written = 0.0, 0
@@ -58,11 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m soilbus.validation.long_log", description=__doc__)
     parser.add_argument("--gigabytes", type=float, default=1.0, help="size of the log (1)")
     parser.add_argument("--hop", type=float, default=1.0, help="seconds between windows (1)")
+    parser.add_argument("--stretch", type=float, default=600.0, help="seconds that are simulated (600)")
     chosen = parser.parse_args(arguments)
     config = reference_configuration([f"estimator.hop={chosen.hop}"])
     with TemporaryDirectory() as folder, cluster(None, print, processes=1) as client:
         log = Path(folder, "long.log")
-        duration = long_log(log, chosen.gigabytes * 1e9)
+        duration = long_log(log, chosen.gigabytes * 1e9, chosen.stretch)
         print(f"a log of {log.stat().st_size / 1e6:.0f} MB, {duration / 3600.0:.2f} h", flush=True)
         (worker,) = client.run(os.getpid).values()
         ended = threading.Event()
@@ -70,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         begin = time.perf_counter()
 
         def look() -> None:
-            while not ended.wait(SAMPLED_EVERY):
+            while not ended.wait(1.0):
                 seen.append((time.perf_counter() - begin, resident(worker), resident(os.getpid())))
 
         looking = threading.Thread(target=look, daemon=True)
