@@ -14,7 +14,7 @@ cat "$process/mountinfo" >"$out/mounts"
 ip -details link show vcan1 >"$out/link"
 candump -L -r 4194304 vcan1 >"$out/bus.log" &
 candump=$!
-canplayer -I "$out/played.log" vcan1=can0 &
+canplayer -l i -I "$out/played.log" vcan1=can0 & # again and again: the service may take long to come back
 candump -n "$(cat "$out/frames-until-window")" vcan1,510:7FF >/dev/null # until a window is full
 note playing
 

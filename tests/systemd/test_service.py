@@ -13,7 +13,7 @@ from installation import REPO, prepare, properties
 
 STATES = {"starting", "waiting", "listening", "estimating", "valid", "degraded", "fault"}
 UNTIL_WINDOW = 13  # s; the first window is full after 10 s
-PLAYED = 40  # s; the player still plays while the service restarts
+PLAYED = 40  # s, again and again
 
 
 @pytest.fixture(scope="module")

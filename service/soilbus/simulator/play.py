@@ -69,7 +69,7 @@ def scenario_over(
     )
 
 
-def send_in_time(messages: Iterable[can.Message], send: Callable[[can.Message], None], speed: float = 1.0) -> None:
+def send_in_time(messages: Iterable[can.Message], send: Callable[[can.Message], None]) -> None:
     """Send messages spaced as their stamps are.
 
     Parameters
@@ -78,15 +78,13 @@ def send_in_time(messages: Iterable[can.Message], send: Callable[[can.Message], 
         In the order of their stamps.
     send
         Sends one.
-    speed
-        Seconds of the recording per second.
     """
     first: float | None = None
     begin = time.monotonic()
     for message in messages:
         if first is None:
             first = message.timestamp
-        ahead = (message.timestamp - first) / speed - (time.monotonic() - begin)
+        ahead = message.timestamp - first - (time.monotonic() - begin)
         if ahead > 0.0005:
             time.sleep(ahead)
         send(message)
