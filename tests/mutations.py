@@ -62,7 +62,7 @@ MUTATIONS = (
     ),
     Mutation(
         "stale inputs do not interrupt", "pipeline/intake.py",
-        "if not now - self.last_seen.get(c.name, since) <= (c.timeout or DEFAULT_TIMEOUT)", "if False",
+        "if not now - self.last_seen.get(c.name, since) <= self._timeout(c)", "if False",
         ("tests/daemon/test_loop.py::test_losing_a_needed_stream_ends_go_within_its_timeout",),
     ),
     Mutation(
@@ -112,7 +112,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a torque limit holds for a second", "pipeline/intake.py",
-        "value[t <= now][-LIMIT_SAMPLES:]", "value[(t <= now) & (t > now - 1.0)][-LIMIT_SAMPLES:]",
+        "value[t <= now][-self._samples :]", "value[(t <= now) & (t > now - 1.0)][-self._samples :]",
         (f"{STORIES}::test_a_torque_limit_that_is_not_sent_any_more_holds",),
     ),
     Mutation(
@@ -122,8 +122,8 @@ MUTATIONS = (
         (f"{STORIES}::test_a_torque_limit_that_is_not_sent_any_more_holds",),
     ),
     Mutation(
-        "a wild torque limit counts", "pipeline/intake.py",
-        "LIMIT_SAMPLES = 3", "LIMIT_SAMPLES = 1",
+        "a wild torque limit counts", "sensors/options.py",
+        "limit_samples: int = 3", "limit_samples: int = 1",
         (f"{STORIES}::test_one_wild_torque_limit_moves_nothing",),
     ),
     Mutation(

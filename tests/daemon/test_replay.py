@@ -94,9 +94,9 @@ def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
     sparse = np.array([0.1, 0.2, 7.3])
     samples = {"torque.A": steady, "load.B": late, "draft": sparse}
     store.add({name: (t, np.ones(len(t))) for name, t in samples.items()})
-    share = dict(zip(rig.channels, coverage(store.window(0.0, 10.0)).tolist(), strict=True))
+    share = dict(zip(rig.channels, coverage(store.window(0.0, 10.0), 0.5).tolist(), strict=True))
     assert share == dict.fromkeys(rig.channels, 0.0) | {"torque.A": 1.0, "load.B": 0.6, "draft": 0.1}
-    assert not coverage(store.window(0.0, bin_length)).any()
+    assert not coverage(store.window(0.0, bin_length), 0.5).any()
 
 
 def test_an_estimator_beside_gives_the_same_results(tmp_path):

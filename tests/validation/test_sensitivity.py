@@ -10,11 +10,18 @@ import pytest
 from soilbus.decision.options import WatchOptions
 from soilbus.diagnosis.options import DiagnosisOptions, TypeOptions
 from soilbus.estimation.options import EstimatorOptions
-from soilbus.sensors.options import ConsistencyOptions
+from soilbus.sensors.options import ConsistencyOptions, ReceptionOptions
 from soilbus.validation.sensitivity import Field, fields_of, with_field
 
 PAGE = Path(__file__).resolve().parents[2] / "service" / "docs" / "sensitivity.md"
-OPTIONS = (EstimatorOptions(), DiagnosisOptions(), TypeOptions(), WatchOptions(), ConsistencyOptions())
+OPTIONS = (
+    EstimatorOptions(),
+    DiagnosisOptions(),
+    TypeOptions(),
+    WatchOptions(),
+    ReceptionOptions(),
+    ConsistencyOptions(),
+)
 FIELDS = [(options, field) for options in OPTIONS for field in fields_of(options)]
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, read, stored_gaussian, write_whole
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import TrackerOptions
+from soilbus.estimation.options import ESTIMATOR
 from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ class StatePersistence:
         elapsed = self._wall() - self._previous.gaussian.at
         return StoredPrior(
             gaussian_of(self._previous.gaussian, self._owner),
-            elapsed if elapsed >= 0.0 else TrackerOptions().gain_correlation_time,
+            elapsed if elapsed >= 0.0 else ESTIMATOR.tracker.gain_correlation_time,
         )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:

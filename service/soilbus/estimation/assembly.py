@@ -21,7 +21,6 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config, ConfigError, Vehicle
 from soilbus.config.model import Effect as EffectSetting
 from soilbus.estimation.instrumentation import (
-    SIDE_SLOPE_SHARE,
     Coupling,
     Group,
     Instrumentation,
@@ -31,6 +30,7 @@ from soilbus.estimation.instrumentation import (
     unit,
 )
 from soilbus.estimation.nuisance_parameters import Free
+from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.terra.effects.effect import Active, Effect, Parameter
@@ -44,13 +44,15 @@ UNKNOWN_SHARE = 0.02
 """Default relative sd of mass, and of the centre of gravity over the wheelbase: `config.model.Vehicle`."""
 
 
-def rig_of(config: Config) -> Rig:
+def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
     """The vehicle with all its wheels, or a test rig with one.
 
     Parameters
     ----------
     config : Config
         Validated configuration.
+    options
+        Of the estimator.
 
     Returns
     -------
@@ -81,6 +83,7 @@ def rig_of(config: Config) -> Rig:
         chassis=chassis_of(config),
         noise=noise,
         lengths=np.array([w.contact_length for w in wheels]) if any(w.contact_length for w in wheels) else None,
+        options=options,
     )
     if config.vehicle is None:
         return rig
@@ -194,7 +197,7 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
         if a.load is not None:
             groups["load"].append(Group(of_axle[a.name], (1.0,) * len(of_axle[a.name]), a.name))
     couplings = tuple(_couplings(config, of_axle, rig.drives, groups))
-    side = math.hypot(computed.gain, SIDE_SLOPE_SHARE if config.signals.roll is None else 0.0)
+    side = math.hypot(computed.gain, rig.options.measurements.side_slope_share if config.signals.roll is None else 0.0)
     torque, speed, load = (
         rows_of(n, groups[quantity], rig.noise[quantity].gain, rows)
         for quantity, rows in (

@@ -7,7 +7,7 @@ no channel is left, what is known without measuring:
 
     torque    T_left - T_right = 0       open differential, sd: its friction; unknown where it is locked
               T = 0                      a wheel that is not driven: solved for its slip, see `observation_model`
-    speed     omega_left - omega_right   0, sd: SLIP_STD, nothing where the differential is locked
+    speed     omega_left - omega_right   0, sd: slip_sd, nothing where the differential is locked
               omega = V / r (1 - s)      a wheel without sensor, until its torque says better
     load      sum W = m g cos(pitch)     and heave: what measured axles bounce
               front less rear            the shift to the front axle by pitch, acceleration and draft
@@ -33,20 +33,6 @@ from soilbus.terra.vehicle import GRAVITY, axle_loads
 
 __all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "with_speeds"]
 
-ROLLING_SLIP = -0.03
-"""Slip of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1 of the
-load takes a skid of 2 to 5 % on field soils (Wong 2008, fig. 2.60)."""
-SLIP_STD = 0.1
-"""Sd of that slip, and of half the difference of two wheels' slips where only their motor's speed is measured."""
-LOCKED_STD = 1e-3
-"""Relative sd of speeds that a shaft makes equal: backlash and twist."""
-LEAST_TORQUE = 0.05
-"""Torque over load and radius that a differential's friction counts at least, and that of a coasting vehicle."""
-SIDE_SLOPE_SHARE = 0.06
-"""Sd of an axle's loads left less right over their sum on side slopes, where no roll is measured: 3 degrees."""
-UNKNOWN_SIDE_SHARE = 0.4
-"""The same for one instant of many: a side slope lasts for seconds, so that a window holds few independent ones;
-0.06 sqrt(2 x 2 s / 0.1 s bin)."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
@@ -358,7 +344,7 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             of_slope = np.where(
                 np.isfinite(window.roll),
                 (2.0 * axle * lever) ** 2 * _known_var(window, "roll"),
-                (UNKNOWN_SIDE_SHARE * axle) ** 2,
+                (rig.options.measurements.unknown_slope * axle) ** 2,
             )
             variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
     return _solved(given.load, load), scale, variance, by_inertia, by_draft
@@ -409,19 +395,20 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
     """Speeds of the wheels, observations of them and their variances, each (N, W)."""
     n, W = len(window.t), len(given.speed)
     speed, variance = np.zeros((n, W)), np.zeros((n, W))
-    rolling = window.ground_speed[:, None] / rig.radius / (1.0 - ROLLING_SLIP)
+    options = rig.options.measurements
+    rolling = window.ground_speed[:, None] / rig.radius / (1.0 - options.rolling_slip)
     for i, row in enumerate(given.speed):
         if row.kind == "channel":
             speed[:, i], variance[:, i] = window.speed[:, row.at], window.variance["speed"][:, row.at]
         elif row.kind == "coupling":
-            relative = np.where(_locked(window, given.couplings[row.at]), LOCKED_STD, 2.0 * SLIP_STD)
+            relative = np.where(_locked(window, given.couplings[row.at]), options.shaft_sd, 2.0 * options.slip_sd)
             size = np.abs(np.array(row.weight)) @ np.nan_to_num(rolling).T / 2.0
             variance[:, i] = (relative * size) ** 2
         elif row.kind == "same":
-            variance[:, i] = (LOCKED_STD * np.nan_to_num(rolling[:, row.at])) ** 2
+            variance[:, i] = (options.shaft_sd * np.nan_to_num(rolling[:, row.at])) ** 2
         else:
             speed[:, i] = rolling[:, row.at]
-            variance[:, i] = (SLIP_STD * rolling[:, row.at]) ** 2
+            variance[:, i] = (options.slip_sd * rolling[:, row.at]) ** 2
     return _solved(given.speed, speed), speed.copy(), variance
 
 
@@ -440,7 +427,7 @@ def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> t
     for i, row in enumerate(given.torque):
         if row.kind == "coupling":
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
-            size = np.abs(zero_if_unknown(shares)) @ weight + LEAST_TORQUE * grip @ weight
+            size = np.abs(zero_if_unknown(shares)) @ weight + rig.options.measurements.min_torque_share * grip @ weight
             variance[:, i] = np.where(_may_be_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
     return shares, np.where(np.isfinite(variance), torque, np.nan), variance
 

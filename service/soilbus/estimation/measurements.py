@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import ROLLING_SLIP, completed
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.local_cubics import Series, curve_of
 from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
@@ -145,7 +145,7 @@ class Measurements:
         speed, speed_var, _ = take("speed")
         self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
         self.rolls = ~rig.drives
-        rolling = self.ground_speed[:, None] / rig.radius / (1.0 - ROLLING_SLIP)
+        rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
@@ -159,7 +159,7 @@ class Measurements:
         self.gain_names, gain_std = gains_of(rig)
         self.gain_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
-        self.slip = np.where(self.rolls, ROLLING_SLIP, slip[kept])
+        self.slip = np.where(self.rolls, rig.options.measurements.rolling_slip, slip[kept])
         self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
         self.by_inertia = self.by_draft = np.zeros_like(self._latents_measured)
         if window.observations is None:

@@ -11,7 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-__all__ = ["EstimatorOptions", "MeasurementOptions", "PosteriorOptions", "SearchOptions", "SolverOptions"]
+__all__ = [
+    "ESTIMATOR",
+    "EstimatorOptions",
+    "MeasurementOptions",
+    "PosteriorOptions",
+    "SearchOptions",
+    "SolverOptions",
+    "TrackerOptions",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +39,22 @@ class MeasurementOptions:
     five blind diagnoses behind differentials (seed 504) are the same."""
     unknown_slope: float = 0.4
     """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, so that slopes alone take the
-    pull: 3 degrees for seconds, of which a window holds few independent ones (as `UNKNOWN_SIDE_SHARE`)."""
+    pull, and of an axle's loads left less right over their sum where no roll is measured: 3 degrees for seconds, of
+    which a window holds few independent ones; 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
+    side_slope_share: float = 0.06
+    """Sd of an axle's mean loads left less right over their sum [1] on side slopes, where no roll is measured: 3
+    degrees."""
+    rolling_slip: float = -0.03
+    """Slip [1] of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1
+    of the load takes a skid of 2 to 5 % on field soils (Wong 2008, fig. 2.60)."""
+    slip_sd: float = 0.1
+    """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is
+    measured; no evidence recorded."""
+    shaft_sd: float = 1e-3
+    """Relative sd [1] of speeds that a shaft makes equal: backlash and twist; no evidence recorded."""
+    min_torque_share: float = 0.05
+    """Torque over load and radius [1] that a differential's friction counts at least, and that of a coasting vehicle;
+    no evidence recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +180,52 @@ class PosteriorOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class TrackerOptions:
+    """Changes of the soil, and what one window's posterior is for the next; a window is `Settings.window` long."""
+
+    false_alarms_per_hour: float = 1.0
+    """Windows an hour [1/h] in which noise alone makes the change detector search for another soil."""
+    mismatch_sd: float = 3.5
+    """Sd of reduced chi-square [sd] by which a window may exceed `Settings.max_chi2`; 0 after a mismatch; no evidence
+    recorded."""
+    settled_sd: float = 1.5
+    """The same [sd] just after a border: its remains in the window bias the soil long before they are a mismatch."""
+    min_evidence_gain: float = 20.0
+    """Fall of -2 log evidence [1] by two soils instead of one from which the change is accepted, and of -2 log
+    posterior, beyond the number of residuals left out, from which these are part of the transition."""
+    max_scale_statistic: float = 25.0
+    """Score statistic [1], chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd."""
+    min_rows_per_soil: int = 30
+    """Residuals that each of two soils needs before they are compared; no evidence recorded."""
+    min_to_detect: float = 0.3
+    """Windows [1] that a soil must fill before a change from it is looked for, that lie before the end of the last
+    fit's data and are looked at again, and after a change point during which data that no soil explains may be of a
+    border."""
+    min_to_learn: float = 0.5
+    """Windows [1] that the data must fill for the posterior to be a later prior: with less it is not Gaussian."""
+    max_unexplained: float = 2.0
+    """Windows [1] after a change point during which a change may explain a mismatch."""
+    extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
+    """Shares [1] of a new soil's data that are tried as part of its transition."""
+    transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
+    """Lengths of a transition that are tried [wheelbases]: borders are sharp or gradual."""
+    default_wheelbase: float = 2.0
+    """Length [m] that stands for the wheelbase of a rig that has none."""
+    gain_memory: float = 60.0
+    """Windows [1] in which the variance of a sensor gain may grow by its whole prior variance."""
+    gain_correlation_time: float = 86400.0
+    """Time [s] in which the autocorrelation of a gain error falls to 1/e: amplifiers drift, tyres wear."""
+
+
+@dataclass(frozen=True, slots=True)
 class EstimatorOptions:
     """All of them."""
 
     measurements: MeasurementOptions = MeasurementOptions()
     search: SearchOptions = SearchOptions()
     posterior: PosteriorOptions = PosteriorOptions()
+    tracker: TrackerOptions = TrackerOptions()
+
+
+ESTIMATOR = EstimatorOptions()
+"""As the service estimates."""

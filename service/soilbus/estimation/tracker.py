@@ -47,6 +47,7 @@ from soilbus.estimation.observation_model import (
     ObservationModelWithEffects,
     Work,
 )
+from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.path_curvature import (
     curvature_of,
@@ -71,7 +72,6 @@ __all__ = [
     "Shown",
     "SoilState",
     "Tracker",
-    "TrackerOptions",
     "TrackerOutput",
     "TrackerState",
     "gain_errors",
@@ -80,62 +80,6 @@ __all__ = [
 ]
 
 _SOIL = len(PARAMETERS)
-
-
-@dataclass(frozen=True, slots=True)
-class TrackerOptions:
-    """Tuning values of the tracker; times in windows are in units of `Settings.window`.
-
-    Attributes
-    ----------
-    false_alarms_per_hour
-        Windows an hour in which noise alone makes the change detector search for another soil (change_detection).
-    mismatch_sd
-        Sd of reduced chi-square by which a window may exceed `Settings.max_chi2`; 0 after a mismatch.
-        No evidence recorded.
-    settled_sd
-        The same just after a border: its remains in the window bias the soil long before they are a mismatch.
-    min_evidence_gain
-        Fall of -2 log evidence by two soils instead of one from which the change is accepted, and of -2 log posterior,
-        beyond the number of residuals left out, from which these are part of the transition.
-    max_scale_statistic
-        Score statistic, chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd.
-    min_rows_per_soil
-        Residuals that each of two soils needs before they are compared.  No evidence recorded.
-    min_to_detect
-        Windows that a soil must fill before a change from it is looked for, that lie before the end of the last fit's
-        data and are looked at again, and after a change point during which data that no soil explains may be of a
-        border.
-    min_to_learn
-        Windows that the data must fill for the posterior to be a later prior: with less it is not Gaussian.
-    max_unexplained
-        Windows after a change point during which a change may explain a mismatch.
-    extension_shares
-        Shares of a new soil's data that are tried as part of its transition.
-    transition_lengths
-        Lengths of a transition that are tried, in wheelbases: borders are sharp or gradual.
-    default_wheelbase
-        Length [m] that stands for the wheelbase of a rig that has none.
-    gain_memory
-        Windows in which the variance of a sensor gain may grow by its whole prior variance.
-    gain_correlation_time
-        Time [s] in which the autocorrelation of a gain error falls to 1/e: amplifiers drift, tyres wear.
-    """
-
-    false_alarms_per_hour: float = 1.0
-    mismatch_sd: float = 3.5
-    settled_sd: float = 1.5
-    min_evidence_gain: float = 20.0
-    max_scale_statistic: float = 25.0
-    min_rows_per_soil: int = 30
-    min_to_detect: float = 0.3
-    min_to_learn: float = 0.5
-    max_unexplained: float = 2.0
-    extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
-    transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
-    default_wheelbase: float = 2.0
-    gain_memory: float = 60.0
-    gain_correlation_time: float = 86400.0
 
 
 class TrackerState(StrEnum):
@@ -374,7 +318,6 @@ class Tracker:
         Effects of the model.
     free : Sequence of Free
         Their parameters.
-    options : TrackerOptions
     """
 
     def __init__(
@@ -385,9 +328,8 @@ class Tracker:
         settings: Settings,
         effects: Sequence[Effect] = (),
         free: Sequence[Free] = (),
-        options: TrackerOptions = TrackerOptions(),
     ) -> None:
-        self.rig, self.prior, self.model, self.settings, self.options = rig, prior, model, settings, options
+        self.rig, self.prior, self.model, self.settings, self.options = rig, prior, model, settings, rig.options.tracker
         self.effects, self.free = tuple(effects), tuple(free)
         self._new_soil_prior = new_soil_prior(prior)
         self._last_run: tuple[Gaussian, float] | None = None
@@ -813,7 +755,7 @@ def prior_from_last_run(
     soil: SoilPrior,
     gain_std: Array,
     elapsed: float,
-    correlation_time: float = TrackerOptions().gain_correlation_time,
+    correlation_time: float = ESTIMATOR.tracker.gain_correlation_time,
 ) -> Gaussian:
     """Joint prior of a run from the posterior of the last one: the soil's prior, and gains drawn back to theirs.
 

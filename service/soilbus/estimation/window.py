@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import Series
-from soilbus.estimation.options import EstimatorOptions
+from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.terra.vehicle import Chassis, pull_required
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Rig:
     """(W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels."""
     mass_std: float = 0.0
     """Relative sd of the mass in `chassis` [1], as far as decisions count it."""
-    options: EstimatorOptions = field(default_factory=EstimatorOptions)
+    options: EstimatorOptions = ESTIMATOR
     """Tuning values of its estimator."""
 
     @property

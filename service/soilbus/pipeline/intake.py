@@ -33,18 +33,11 @@ from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Wind
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import SensorConsistency, without
+from soilbus.sensors.options import RECEPTION, ReceptionOptions
 from soilbus.sensors.outliers import OUTLIER
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import slip_ratio
 
-DEFAULT_TIMEOUT = 1.0
-"""Age [s] from which a channel without a configured time-out is stale.  No evidence recorded."""
-LIMIT_SAMPLES = 3
-"""Number of reported torque limits whose median is in force: one outlier does not change it."""
-COVERAGE_BLOCK = 0.5
-"""Time [s] of a block that counts as covered if it has a sample.  No evidence recorded."""
-MIN_COVERAGE = 0.95
-"""Share of a window's blocks that a needed channel must cover.  No evidence recorded."""
 EDGE_LEAD = 0.005
 """Bins begin this long before the first sample [s]: else each frame of its message would fall on
 an edge, and a microsecond would decide on which side."""
@@ -152,7 +145,7 @@ class ReportedLimits:
     """Torque limit [N m] of each motor (W,): as reported, else as configured, else nan.
 
     A reported limit holds until another one is reported, also through silence and a set clock.  It is the median of the
-    last LIMIT_SAMPLES samples.
+    last samples.
 
     A motor of several wheels gives each the share that `Motor.share` says; a wheel that is not driven has the limit 0.
 
@@ -160,10 +153,12 @@ class ReportedLimits:
     ----------
     motors
         Of the vehicle; a wheel's limit is that of the last motor with one that drives it.
+    samples
+        Number of the last samples.
     """
 
-    def __init__(self, motors: Motors) -> None:
-        self._motors = motors
+    def __init__(self, motors: Motors, samples: int = RECEPTION.limit_samples) -> None:
+        self._motors, self._samples = motors, samples
         self._names = {motor.name for motor in motors.motors}
         self._reported: dict[str, tuple[Array, Array]] = {}
 
@@ -184,13 +179,13 @@ class ReportedLimits:
 
     def _of(self, motor: Motor, now: float) -> float:
         t, value = self._reported.get(motor.name, (np.empty(0), np.empty(0)))
-        last = value[t <= now][-LIMIT_SAMPLES:]
+        last = value[t <= now][-self._samples :]
         return median(last.tolist()) if len(last) else motor.max_torque
 
     def drop_before(self, end: float) -> None:
         """Forget samples that are no longer among the last ones at the time `end` [s]."""
         for wheel, (t, value) in self._reported.items():
-            first = max(int(np.count_nonzero(t <= end)) - LIMIT_SAMPLES, 0)
+            first = max(int(np.count_nonzero(t <= end)) - self._samples, 0)
             self._reported[wheel] = t[first:], value[first:]
 
     def forget_times(self) -> None:
@@ -207,6 +202,8 @@ class Intake:
         The configuration and the messages of the vehicle's bus.
     delays
         [s] by quantity, added to each channel's `delay`; None takes those of the configured effects.
+    options
+        Which samples and which windows are used.
 
     Raises
     ------
@@ -219,8 +216,14 @@ class Intake:
     its end by that delay.  Freshness goes by the stamps of the frames.
     """
 
-    def __init__(self, config: Config, database: Database, delays: Mapping[str, float] | None = None) -> None:
-        self._config, self._database, self._delays = config, database, delays
+    def __init__(
+        self,
+        config: Config,
+        database: Database,
+        delays: Mapping[str, float] | None = None,
+        options: ReceptionOptions = RECEPTION,
+    ) -> None:
+        self._config, self._database, self._delays, self._options = config, database, delays, options
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config, database))
         self.rig = rig_of(config)
@@ -228,7 +231,7 @@ class Intake:
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
         self._positions = PositionTrack(
-            {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
+            {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}, options.fix_smoothing
         )
         self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
         of_effects = delays_of(config) if delays is None else delays
@@ -237,7 +240,7 @@ class Intake:
         self._waits = {name: self._latest - delay for name, delay in late.items() if self._latest != delay}
         self._settings = config.estimator
         self._decision = config.traversability
-        self._limits = ReportedLimits(motors_of(config, self.rig))
+        self._limits = ReportedLimits(motors_of(config, self.rig), options.limit_samples)
         self._index = 0
         self.epoch = 0
         self._ready: list[WindowTask] = []
@@ -247,10 +250,13 @@ class Intake:
 
     def of_another_recording(self) -> Intake:
         """A new intake without any data, which continues the counts of windows, frames and refusals."""
-        other = Intake(self._config, self._database, self._delays)
+        other = Intake(self._config, self._database, self._delays, self._options)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
         return other
+
+    def _timeout(self, channel: Channel) -> float:
+        return channel.timeout or self._options.timeout
 
     def _is_needed(self, channel: Channel) -> bool:
         if channel.wheel:
@@ -293,7 +299,7 @@ class Intake:
             first, last = times
             self._newest = max(self._newest, last)
             if self._bins is None:
-                self._bins = Bins(self.rig, self._settings.bin, first - EDGE_LEAD)
+                self._bins = Bins(self.rig, self._settings.bin, first - EDGE_LEAD, self._options)
                 self.next_end = first - EDGE_LEAD + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
@@ -354,8 +360,8 @@ class Intake:
         window = completed(raw, self.rig)
         self.refusals.note_outliers(bins.new_outliers())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
-        covered = dict(zip(self.rig.channels, coverage(raw).tolist(), strict=True))
-        badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
+        covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
+        badly_covered = [c.name for c in self.needed if covered[c.name] < self._options.min_coverage]
         poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
         task = WindowTask(
             index=self._index,
@@ -389,7 +395,7 @@ class Intake:
         return [
             c.name
             for c in self.needed
-            if not now - self.last_seen.get(c.name, since) <= (c.timeout or DEFAULT_TIMEOUT)  # nor nan
+            if not now - self.last_seen.get(c.name, since) <= self._timeout(c)  # nor nan
         ]
 
     def refused(self, now: float) -> dict[str, str]:
@@ -397,7 +403,7 @@ class Intake:
         return {
             c.name: self._last_refused[c.name][1]
             for c in self.needed
-            if c.name in self._last_refused and now - self._last_refused[c.name][0] <= (c.timeout or DEFAULT_TIMEOUT)
+            if c.name in self._last_refused and now - self._last_refused[c.name][0] <= self._timeout(c)
         }
 
     def latest(self, now: float) -> Latest:
@@ -440,13 +446,13 @@ def column_means(rows: Array) -> list[float | None]:
     return [float(s / n) if n else None for s, n in zip(total, count, strict=True)]
 
 
-def coverage(window: Window) -> Array:
-    """Share of the window's half seconds in which each of the rig's channels has a sample, (channels,)."""
+def coverage(window: Window, span: float) -> Array:
+    """Share of the window's blocks of `span` [s] in which each of the rig's channels has a sample, (channels,)."""
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
     known = np.isfinite(np.column_stack([getattr(window, q) for q in quantities]))
     if len(known) < 2:
         return np.zeros(known.shape[1])
-    block = ((window.t - window.t[0]) / COVERAGE_BLOCK + 1e-6).astype(int)
+    block = ((window.t - window.t[0]) / span + 1e-6).astype(int)
     begins = [0, *(np.flatnonzero(block[1:] != block[:-1]) + 1)]
     share: Array = np.logical_or.reduceat(known, begins).sum(0) / (block[-1] + 1)
     return share

@@ -14,7 +14,6 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import effects_of, model_of
-from soilbus.estimation.instrumentation import ROLLING_SLIP
 from soilbus.estimation.window import Rig, pairs
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -58,7 +57,8 @@ def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
     phase = 2.0 * np.pi * t / config.estimator.window
     slip = SLIP_RANGE[0] + (SLIP_RANGE[1] - SLIP_RANGE[0]) * (1.0 - np.cos(phase)) / 2.0
     length = 0.0 if rig.lengths is None else rig.lengths[:, None]
-    slip = np.where(rig.drives[:, None], slip, np.where(np.asarray(length) > 0.0, 0.0, ROLLING_SLIP))
+    rolling = np.where(np.asarray(length) > 0.0, 0.0, rig.options.measurements.rolling_slip)
+    slip = np.where(rig.drives[:, None], slip, rolling)
     radius, width, rear = rig.radius[:, None], rig.width[:, None], ~rig.front[:, None]
     share = np.ones((len(rear), len(t))) / np.where(rear, rear.sum(), (~rear).sum())
     share[pairs(rig)] *= 1.0 + SIDE_LOAD_SHARE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]

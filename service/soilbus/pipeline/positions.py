@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.sensors.options import RECEPTION
 from soilbus.terra.earth import wrapped
 
-SMOOTHING = 1.0
-"""Time [s] before and after, within which fixes are averaged: receivers are noisy.  No evidence recorded."""
 NO_FIX = 1e-9
 """Angle [rad] below which a coordinate is zero: what receivers send before they have a fix."""
 
@@ -35,10 +34,12 @@ class PositionTrack:
     ----------
     timeout
         [s], longest gap between two fixes, by channel name; empty where no position is mapped.
+    smoothing
+        Time [s] before and after, within which fixes are averaged.
     """
 
-    def __init__(self, timeout: Mapping[str, float]) -> None:
-        self._timeout = dict(timeout)
+    def __init__(self, timeout: Mapping[str, float], smoothing: float = RECEPTION.fix_smoothing) -> None:
+        self._timeout, self._smoothing = dict(timeout), smoothing
         self.forget()
 
     def forget(self) -> None:
@@ -47,7 +48,7 @@ class PositionTrack:
 
     def copy(self) -> PositionTrack:
         """A copy that later fixes do not change."""
-        track = PositionTrack(self._timeout)
+        track = PositionTrack(self._timeout, self._smoothing)
         track._fixes = dict(self._fixes)
         return track
 
@@ -80,7 +81,7 @@ class PositionTrack:
         after = int(np.searchsorted(times, t))
         if not 0 < after < len(times) or times[after] - times[after - 1] > self._timeout[name]:
             return None
-        near = min(SMOOTHING, self._timeout[name])
+        near = min(self._smoothing, self._timeout[name])
         low = min(int(np.searchsorted(times, t - near)), after - 1)
         high = max(int(np.searchsorted(times, t + near, "right")), after + 1)
         reference = float(value[after])

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.window import WHEEL_QUANTITIES, NoiseTable, Rig, Window, made_window
+from soilbus.sensors.options import RECEPTION, ReceptionOptions
 from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
-
-GLIMPSE_BACK = 1.0
-"""Time [s] before a glimpse whose samples enter the outlier test of those in it."""
 
 
 class Bins:
@@ -36,10 +34,12 @@ class Bins:
         [s].
     origin
         [s], where the first bin begins.
+    options
+        Of the outlier test, and of `rates.resolved_window`.
     """
 
-    def __init__(self, rig: Rig, bin_length: float, origin: float) -> None:
-        self.rig = rig
+    def __init__(self, rig: Rig, bin_length: float, origin: float, options: ReceptionOptions = RECEPTION) -> None:
+        self.rig, self.options = rig, options
         self.bin_length = bin_length
         self.origin = origin
         self._index = {name: i for i, name in enumerate(rig.channels)}
@@ -62,7 +62,7 @@ class Bins:
     def window(self, start: float, end: float) -> Window:
         """The bins from start to end [s], both rounded to whole bins."""
         low, high = self._span(start, end)
-        samples, outlier, later = outlier_test(self._taken(high), self._noise.sd)
+        samples, outlier, later = outlier_test(self._taken(high), self._noise.sd, self.options)
         new = ~samples.settled
         self._totals = self._with(self._totals, samples.pick(new & ~outlier), high)
         again = new & outlier & (later < SIDE)
@@ -78,15 +78,15 @@ class Bins:
         recent = list(self._recent)
         samples = self._taken(high)
         self._recent = recent
-        near = self._bins(samples) >= low - round(GLIMPSE_BACK / self.bin_length)
-        samples, outlier, _ = outlier_test(samples.pick(near), self._noise.sd)
+        samples, outlier, _ = outlier_test(samples, self._noise.sd, self.options)
         totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | outlier)), high)
         return self._made(totals, low, high)
 
     def screened(self, end: float) -> Samples:
         """The samples before `end` [s] without outliers, times [s] from `origin`; the state does not change."""
         recent = list(self._recent)
-        samples, outlier, _ = outlier_test(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
+        high = round((end - self.origin) / self.bin_length)
+        samples, outlier, _ = outlier_test(self._taken(high), self._noise.sd, self.options)
         self._recent = recent
         return samples.pick(~outlier)
 

@@ -1,5 +1,6 @@
-"""Options of the sensors' consistency: its tuning values, each once, with unit and source or evidence.
+"""Options of what becomes of samples, and of the sensors' consistency: each value once, with its unit and evidence.
 
+    ReceptionOptions   -> Intake, Bins, outliers, rates
     ConsistencyOptions -> consistency.implausible, decision.traction_loss
 
 What a change of 30 % does to each is in service/docs/sensitivity.md.
@@ -9,7 +10,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["CONSISTENCY", "ConsistencyOptions"]
+__all__ = ["CONSISTENCY", "RECEPTION", "ConsistencyOptions", "ReceptionOptions"]
+
+
+@dataclass(frozen=True, slots=True)
+class ReceptionOptions:
+    """Which samples are outliers, how short bins are, and which windows have data enough."""
+
+    outlier_sd: float = 6.5
+    """Distance from the line [sd of the sensor] from which a sample may be an outlier."""
+    quartile_distances: float = 3.0
+    """Distances of the quartiles around a sample [1] that it may always lie off: in steps and bumps real signals do."""
+    vibrating_sd: float = 1.5
+    """A channel that scatters by more than this [sd of the sensor] vibrates, or its noise is set too low: it is judged
+    by its own scatter."""
+    vibrating_outlier_sd: float = 8.0
+    """Distance from the line [sd of that scatter] from which a sample of such a channel is an outlier."""
+    max_loss: float = 0.1
+    """Share [1] of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise."""
+
+    timeout: float = 1.0
+    """Age [s] from which a channel without a configured time-out is stale; no evidence recorded."""
+    covered_block: float = 0.5
+    """Time [s] of a block that counts as covered if it has a sample; no evidence recorded."""
+    min_coverage: float = 0.95
+    """Share [1] of a window's blocks that a needed channel must cover; no evidence recorded."""
+    limit_samples: int = 3
+    """Number of reported torque limits whose median is in force: one outlier does not change it."""
+    fix_smoothing: float = 1.0
+    """Time [s] before and after, within which fixes are averaged: receivers are noisy; no evidence recorded."""
+
+
+RECEPTION = ReceptionOptions()
+"""As the service receives."""
 
 
 @dataclass(frozen=True, slots=True)

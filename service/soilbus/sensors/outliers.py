@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array, Mask
+from soilbus.sensors.options import RECEPTION, ReceptionOptions
 
 Sd = Callable[[NDArray[np.intp], Array, Array], Array]
 """Sd (N,) of samples, channel after channel, from each channel's number of them (C,), their expected
@@ -27,15 +28,6 @@ OUTLIER = "outlier"
 SIDE = 4
 """Samples on each side that a sample is compared with."""
 SPAN = 2 * SIDE + 1
-OUTLIER_SD = 6.5
-"""Distance from the line, in standard deviations of the sensor, from which a sample may be an outlier."""
-QUARTILE_DISTANCES = 3.0
-"""Distances of the quartiles around a sample that it may always lie off: in steps and bumps real signals do."""
-VIBRATING_SD = 1.5
-"""A channel that scatters by more than this multiple of its sensor's noise (it vibrates, or its noise is set too low)
-is judged by its own scatter."""
-VIBRATING_OUTLIER_SD = 8.0
-"""Distance from the line, in standard deviations of that scatter, from which a sample of such a channel is one."""
 MEDIAN_SECOND_DIFFERENCE = 1.65
 """Median second difference of normal samples, in their standard deviation."""
 
@@ -69,7 +61,7 @@ class Tested(NamedTuple):
     later: NDArray[np.intp]
 
 
-def outlier_test(samples: Samples, sd: Sd) -> Tested:
+def outlier_test(samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION) -> Tested:
     """Find the outliers among samples in any order.
 
     A channel with fewer than nine samples is not judged; the first and last four of the
@@ -93,14 +85,14 @@ def outlier_test(samples: Samples, sd: Sd) -> Tested:
     off = np.abs(value - expected)
     size = np.abs(expected)
     noise = sd(count, size, np.bincount(column, size) / np.maximum(count, 1))
-    far = np.flatnonzero(off > OUTLIER_SD * noise)
+    far = np.flatnonzero(off > options.outlier_sd * noise)
     far = far[count[column[far]] >= SPAN]
     if len(far):
-        limit = QUARTILE_DISTANCES * _spread(t, value, line[far], slope[far])
+        limit = options.quartile_distances * _spread(t, value, line[far], slope[far])
         vibration = _vibration(value, noise, end - count, end, column[far])
-        np.maximum(
-            limit, np.where(vibration > VIBRATING_SD, VIBRATING_OUTLIER_SD * vibration, 0.0) * noise[far], out=limit
-        )
+        vibrating = vibration > options.vibrating_sd
+        by_scatter = np.where(vibrating, options.vibrating_outlier_sd * vibration, 0.0) * noise[far]
+        np.maximum(limit, by_scatter, out=limit)
         outlier[far] = off[far] > limit
     return Tested(samples, outlier, later)
 

@@ -15,6 +15,7 @@ error below the noise: at most 3/128 of the fourth difference.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -28,12 +29,8 @@ from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
 
-MAX_LOSS = 0.1
-"""Share of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise itself."""
 NEEDED = ("torque", "load", "speed", "ground_speed", "draft")
 """Quantities without which the model has no residual."""
-MAX_PARTS = 10
-"""Largest number of parts into which the configured bin is divided."""
 
 
 class _Channel(NamedTuple):
@@ -81,7 +78,7 @@ def resolved_window(store: Bins, end: float) -> Window:
     span = end - store.origin
     names = store.rig.channels
     curves = {names[c.column]: c.series().later(store.origin) for c in channels}
-    length = _bin_length(channels, store.bin_length, span)
+    length = _bin_length(channels, store.bin_length, span, store.options.max_loss)
     if length >= store.bin_length:
         return replace(whole, curves=curves)
     n = int(np.floor(span / length + 1e-9))
@@ -105,18 +102,14 @@ def _channels(samples: Samples, store: Bins, noise: NoiseTable) -> Iterator[_Cha
         yield _Channel(column, t, value, curve_of(t, value, variance), needed)
 
 
-def _bin_length(channels: Iterable[_Channel], longest: float, span: float) -> float:
-    """Length of the bins [s]: the longest / k, k = 1, 2, ..., at which no needed channel loses more than MAX_LOSS."""
+def _bin_length(channels: Iterable[_Channel], longest: float, span: float, max_loss: float) -> float:
+    """Length of the bins [s]: the longest / k, k = 1, 2, ..., at which no needed channel loses more than `max_loss`."""
     needed = [c for c in channels if c.needed and c.curve.step > 0.0]
     slowest = max((c.curve.step for c in needed), default=longest)
-    counted = [c for c in needed if 2.0 / len(c.t) < MAX_LOSS**2]  # the loss of fewer samples is too uncertain
-    for parts in range(1, MAX_PARTS + 1):
-        length = longest / parts
-        if length <= slowest:
-            break
-        if all(_lost(c, length, int(span / length)) <= MAX_LOSS for c in counted):
-            return length
-    return min(longest, slowest)
+    counted = [c for c in needed if 2.0 / len(c.t) < max_loss**2]  # the loss of fewer samples is too uncertain
+    lengths = itertools.takewhile(lambda length: length > slowest, (longest / parts for parts in itertools.count(1)))
+    few = (length for length in lengths if all(_lost(c, length, int(span / length)) <= max_loss for c in counted))
+    return next(few, min(longest, slowest))
 
 
 def _lost(channel: _Channel, length: float, n: int) -> float:

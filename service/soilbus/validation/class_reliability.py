@@ -17,9 +17,8 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.options import SearchOptions
+from soilbus.estimation.options import ESTIMATOR, SearchOptions
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
-from soilbus.estimation.tracker import TrackerOptions
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -71,7 +70,7 @@ def windows(count: int, seed: int, seconds: float, slip: float = 0.4) -> Iterato
         if (
             fit is None
             or not fit.converged
-            or fit.chi2 > 1.1 + TrackerOptions().mismatch_sd * math.sqrt(2.0 / fit.rows)
+            or fit.chi2 > 1.1 + ESTIMATOR.tracker.mismatch_sd * math.sqrt(2.0 / fit.rows)
         ):
             continue  # the service reports such a window as degraded or invalid
         yield Prediction(classes.probabilities(fit.posterior, prior), truth)

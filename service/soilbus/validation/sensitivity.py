@@ -6,10 +6,13 @@
                  greatest |change of log pressure| / sd,  change of the model evaluations [%]
     types        types that get or lose an effect, types of which other vehicles agree, greatest change of a probability
     watch        boggings more or less in time, greatest change of a lead [s], false warnings more or less
+    reception    spikes and sound samples refused more or less, windows more or less with data enough, bins of whole
+                 recordings [%], windows with another torque limit, greatest change of a moment's slip [0.01] and of a
+                 position [m]
     consistency  faults of sensors found more or less, windows more or less in which a sound one is named
 
 Each field of the options is multiplied by 0.7 and by 1.3, counts rounded and changed by at least one, on fixed seeded
-drives, cases, types of vehicles, boggings and faults (`estimates`, `diagnoses`, `types`, `watches`,
+drives, cases, types of vehicles, boggings and faults (`estimates`, `diagnoses`, `types`, `watches`, `receptions`,
 `contradictions`).  A field of the solver is changed in the joint descent from a cold start, and in other descents where
 they have a value of their own.  `--page` writes the tables of service/docs/sensitivity.md.
 """
@@ -32,6 +35,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.can.channels import Column, Decoded
+from soilbus.can.dbc_files import load_databases
 from soilbus.config.model import Config
 from soilbus.decision import options as of_watch
 from soilbus.decision.options import WatchOptions
@@ -47,14 +52,16 @@ from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.options import EstimatorOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.tracker import Tracker
-from soilbus.estimation.window import Rig, Window, forward
+from soilbus.estimation.window import NoiseTable, Rig, Window, forward
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.intake import Intake
 from soilbus.sensors import options as of_sensors
 from soilbus.sensors.consistency import implausible
-from soilbus.sensors.options import ConsistencyOptions
+from soilbus.sensors.options import ConsistencyOptions, ReceptionOptions
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import REAR_DRIVE, TRACTOR, reference_configuration
+from soilbus.simulator.reference import AXLE_MOTORS, REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.earth import SEMI_MAJOR_AXIS
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.validation.blind.cases import Case, cases
@@ -143,14 +150,14 @@ def meanings(module: Any) -> Mapping[tuple[str, str], str]:
 
 
 def fields_of(options: Any, path: tuple[str, ...] = ()) -> Iterator[Field]:
-    """All fields of options and of the options in them; of a descent only what is its own, but for `cold`."""
+    """All numbers of options and of the options in them; of a descent only what is its own, but for `cold`."""
     texts = {**meanings(of_estimator), **meanings(of_diagnosis), **meanings(of_watch), **meanings(of_sensors)}
     for field in fields(options):
         value, here = getattr(options, field.name), (*path, field.name)
         is_shared = isinstance(options, SolverOptions) and path[-1] != "cold" and value == field.default
         if is_dataclass(value):
             yield from fields_of(value, here)
-        elif math.isfinite(value) and value != 0.0 and not is_shared:
+        elif not isinstance(value, tuple) and math.isfinite(value) and value != 0.0 and not is_shared:
             yield Field(here, value, texts[type(options).__name__, field.name])
 
 
@@ -179,7 +186,8 @@ class Drive(NamedTuple):
 
 @cache
 def drives() -> tuple[Drive, ...]:
-    """Three soils from cold to warm, constant slip, short windows, a border, a curve, free wheels, an effect."""
+    """Three soils from cold to warm, constant slip, short windows, two borders, a curve, free wheels,
+    one motor's speed for two wheels, no load cells, an effect."""
     loam = _drive([], "loam", 11.0)
     rig, model = rig_of(loam.config), loam.config.model
     turned = [(curved(w, rig, np.interp(w.t, [5.0, 6.0], [0.0, 1.0 / 25.0])), end) for w, end in loam.windows[:1]]
@@ -191,18 +199,24 @@ def drives() -> tuple[Drive, ...]:
         _drive([], "dry_sand", 10.0, sinkage=False),
         _drive([], "loam", 10.0, slip=STEADY, sinkage=False),
         *(_drive(["estimator.window=2"], soil, 2.0, sinkage=False) for soil in ("loam", "wet_clay", "dry_sand")),
-        _drive([], "loam", 14.0, then="wet_clay"),
+        _drive([], "loam", 24.0, then="wet_clay"),
+        _drive([], "wet_clay", 24.0, then="loam"),
         Drive(loam.config, turned),
         _drive([], "loam", 10.0, path=REAR_DRIVE),
+        _drive([], "wet_clay", 10.0, path=REAR_DRIVE, wheel_speeds=False),
+        _drive([], "wet_clay", 10.0, path=AXLE_MOTORS),
         Drive(loam.config.model_copy(update={"model": effect}), loam.windows[:1]),
     )
 
 
 def _drive(
     settings: list[str], soil: str, seconds: float, slip: Swing = SWEPT, sinkage: bool = True, then: str | None = None,
-    path: Path = TRACTOR,
+    path: Path = TRACTOR, wheel_speeds: bool = True,
 ) -> Drive:  # fmt: skip
     config = reference_configuration(settings, path)
+    if not wheel_speeds:
+        wheels = [wheel.model_copy(update={"speed": None}) for wheel in config.wheel]
+        config = config.model_copy(update={"wheel": wheels})
     patches = (Patch(0.0, soil),) if then is None else (Patch(0.0, soil), Patch(16.0, then))
     recording = simulate(config, Scenario(seconds, patches, slip=slip), 501)
     if not sinkage:
@@ -215,7 +229,7 @@ def estimates(options: EstimatorOptions) -> list[Estimated]:
     """The result of every window of the drives."""
     found = []
     for config, data in drives():
-        estimator = WindowEstimator(config, partial(_tracker, options))
+        estimator = WindowEstimator(config, partial(_tracker, rig_of(config, options)))
         for i, (window, end) in enumerate(data):
             result = estimator.estimate(task_of(window, end, config, i)).result
             posterior, nothing = result.posterior, np.full(3, np.nan)
@@ -230,8 +244,9 @@ def estimates(options: EstimatorOptions) -> list[Estimated]:
     return found
 
 
-def _tracker(options: EstimatorOptions, rig: Rig, *further: Any) -> Tracker:
-    return Tracker(replace(rig, options=options), *further)
+def _tracker(rig: Rig, _: Rig, *further: Any) -> Tracker:
+    """A tracker of a rig with other options in place of the configured one."""
+    return Tracker(rig, *further)
 
 
 def change_of_estimates(before: Sequence[Estimated], after: Sequence[Estimated]) -> str:
@@ -387,6 +402,95 @@ def change_of_watches(before: Sequence[WarningTrial], after: Sequence[WarningTri
     return _words((in_time, "{:+d} in time"), (lead, "{:.1f} s"), (false, "{:+d} false"))
 
 
+SILENCES: Mapping[str, tuple[tuple[float, float], ...]] = {
+    "load.FL": ((15.2, 0.4), (19.2, 0.5), (23.2, 0.6)), "speed.RR": ((34.2, 0.8),), "torque.FR": ((49.0, 1.2),),
+    "ground_speed": ((63.0, 1.0), (78.0, 1.5)),
+}  # fmt: skip
+"""Times [s] at which channels say nothing, and for how long [s]."""
+SPIKES, SPIKE_SD = 0.01, (4.0, 16.0)
+"""Share of the samples that are spikes, and their sizes [sd of the sensor]."""
+
+
+class Heard(NamedTuple):
+    """What the intake makes of a drive: samples refused, whether each window has data enough, torque limits, moments'
+    slips and positions at the windows' ends, and the bin length of the whole drive."""
+
+    refused: int
+    enough: Array
+    limit: Array
+    slip: Array
+    position: Array
+    bin_length: float
+
+
+@cache
+def heard_drives() -> tuple[tuple[Config, Mapping[str, Column]], ...]:
+    """A smooth drive and one with loads that shake, as they are; the second one with spikes, and with silences."""
+    config = reference_configuration()
+    smooth, shaking = (
+        dict(simulate(config, Scenario(90.0, (Patch(0.0, "loam"),), slip=SWEPT, bounce=bounce), 521).channels)
+        for bounce in (0.0, 0.12)
+    )
+    sd, rng = NoiseTable.of(rig := rig_of(config)), np.random.default_rng(522)
+    spiked, silent = dict(shaking), dict(shaking)
+    for name, column in shaking.items():
+        t, value = column.t, column.value
+        size = np.where(rng.random(len(t)) < SPIKES, rng.uniform(*SPIKE_SD, len(t)), 0.0) * rng.choice((-1, 1), len(t))
+        if name in rig.channels:
+            spiked[name] = Column(t, value + size * np.sqrt(sd.of_samples(value, rig.channels.index(name))))
+        elif name.startswith("torque_limit"):
+            spiked[name] = Column(t, np.where(size == 0.0, value, 0.0))
+        in_silence = [(t >= begin) & (t < begin + length) for begin, length in SILENCES.get(name, ())]
+        kept = ~np.any(in_silence, axis=0) if in_silence else np.ones(len(t), bool)
+        silent[name] = Column(t[kept], value[kept])
+    return tuple((config, channels) for channels in (smooth, shaking, spiked, silent))
+
+
+def receptions(options: ReceptionOptions) -> list[Heard]:
+    """What the intake makes of every drive."""
+    return [_heard(config, channels, options) for config, channels in heard_drives()]
+
+
+def _heard(config: Config, channels: Mapping[str, Column], options: ReceptionOptions) -> Heard:
+    intake = Intake(config, load_databases(config), options=options)
+    enough: list[bool] = []
+    limit, slip, position = [], [], []
+    for now in np.arange(config.estimator.hop, 90.0, config.estimator.hop).tolist():
+        intake.add(_decoded(channels, now - config.estimator.hop, now))
+        for task in intake.due(now):
+            enough.append(not task.poor)
+            limit.append(task.torque_limit)
+            position.append(task.track.at((task.start + task.end) / 2.0) or (math.nan, math.nan))
+        slip.append([math.nan if s is None else s for s in intake.latest(now).slip.values()])
+    whole = Intake(config, load_databases(config), options=options)
+    whole.add(_decoded(channels, 0.0, 20.0))
+    window = whole.taken_whole()
+    length = math.nan if window is None else float(window.t[1] - window.t[0])
+    return Heard(
+        intake.refusals.refused, np.array(enough), np.array(limit), np.array(slip), np.array(position), length
+    )  # fmt: skip
+
+
+def _decoded(channels: Mapping[str, Column], begin: float, end: float) -> Decoded:
+    parts = {name: slice(*np.searchsorted(c.t, (begin, end))) for name, c in channels.items()}
+    return Decoded({name: Column(c.t[parts[name]], c.value[parts[name]]) for name, c in channels.items()})
+
+
+def change_of_receptions(before: Sequence[Heard], after: Sequence[Heard]) -> str:
+    """What moved, in a few words; empty where nothing did."""
+    pairs = list(zip(before, after, strict=True))
+    more = [b.refused - a.refused for a, b in pairs]
+    enough = sum(int(b.enough.sum() - a.enough.sum()) for a, b in pairs)
+    limits = sum(int((a.limit != b.limit).any(axis=1).sum()) for a, b in pairs)
+    bins = max((b.bin_length / a.bin_length - 1.0 for a, b in pairs), key=abs)
+    slip = max(float(np.nanmax(np.abs(a.slip - b.slip), initial=0.0)) for a, b in pairs)
+    position = SEMI_MAJOR_AXIS * max(float(np.nanmax(np.abs(a.position - b.position), initial=0.0)) for a, b in pairs)
+    return _words(
+        (more[2] - more[1], "{:+d} found"), (more[0] + more[1], "{:+d} false"), (enough, "{:+d} enough"),
+        (100.0 * bins, "bins {:+.0f} %"), (limits, "{} limits"), (slip, "slip {:.2f}"), (position, "{:.1f} m"),
+    )  # fmt: skip
+
+
 class Contradiction(NamedTuple):
     """The channels that are named in a window, and the one with a fault, if any."""
 
@@ -464,6 +568,7 @@ TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Callable[[Any, Any], str]], 
     ("diagnosis", DiagnosisOptions(), diagnoses, change_of_diagnoses),
     ("types", TypeOptions(), types, change_of_types),
     ("watch", WatchOptions(), watches, change_of_watches),
+    ("reception", ReceptionOptions(), receptions, change_of_receptions),
     ("consistency", ConsistencyOptions(), contradictions, change_of_contradictions),
 )
 """Name, options, what they are tried on, and how two results are compared."""

@@ -23,7 +23,8 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import chassis_of, rig_of
-from soilbus.estimation.instrumentation import UNKNOWN_SIDE_SHARE, Row, unit
+from soilbus.estimation.instrumentation import Row, unit
+from soilbus.estimation.options import ESTIMATOR
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.vehicle import GRAVITY, axle_loads
@@ -191,7 +192,7 @@ class _Instants:
     def noise(self, value: Array) -> Array:
         """Sd of each reading (N, R) of these values."""
         sd, computed = np.empty_like(value), self.config.noise.computed_load.relative
-        of_slope = UNKNOWN_SIDE_SHARE * (self.config.signals.roll is None)
+        of_slope = ESTIMATOR.measurements.unknown_slope * (self.config.signals.roll is None)
         load, _, torque = self._forces(self.latents, self.log_soil)
         grip = load * [wheel.radius for wheel in self.config.wheel]
         for k, row in enumerate(self.of):
