@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import logging
 import math
 from collections import Counter
 from copy import copy
@@ -214,6 +215,27 @@ def test_losing_a_needed_stream_ends_go_within_its_timeout(recording, lost):
     assert late
     assert {str(f["State"]) for f in late} == {"unknown"}
     assert str(bench.sent("SoilbusStatus")[-1]["State"]) == "degraded"
+
+
+def test_the_journal_says_which_input_fails_and_that_it_is_back(recording, caplog):
+    load = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    start = recording[0].timestamp
+
+    def is_lost(t: float) -> bool:  # for 4 s, and again a while later
+        return 5.0 <= t - start < 9.0 or 12.0 <= t - start < 15.0
+
+    bench = Bench([m for m in recording if m.arbitration_id != load or not is_lost(m.timestamp)])
+    with caplog.at_level(logging.INFO, logger="soilbus.daemon.service"):
+        bench.run(DURATION)
+    failing = "input_stale load.FL load.FR load.RL load.RR: no decision until it is back"
+    assert [r.getMessage() for r in caplog.records if "back" in r.getMessage()] == [failing, "inputs are back"]
+
+
+def test_a_bus_on_which_nothing_was_heard_yet_is_no_failure(caplog):
+    bench = Bench([])
+    bench.run(5.0)
+    assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) == "no_frames"
+    assert not caplog.records
 
 
 def test_silence_ends_go_and_is_no_reason_to_stop(recording):

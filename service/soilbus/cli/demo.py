@@ -11,6 +11,7 @@ drive plays TIME_COMPRESSION times as fast as real time, so the service's times 
 from __future__ import annotations
 
 import io
+import logging
 import re
 import subprocess
 import threading
@@ -57,6 +58,7 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
     `picture` is where the last state of the dashboard is kept as SVG; the engineer's page has `-engineer` in its name.
     """
     console = Console()
+    logging.getLogger("soilbus").setLevel(logging.ERROR)  # the dashboard shows what the service's journal says
     real = reference_configuration()
     recording = simulate(real, demo_scenario(duration), SEED)
     messages = _from_now_on(_every_second(frames(recording, real)))

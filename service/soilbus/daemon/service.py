@@ -21,7 +21,7 @@ from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
-from soilbus.can.bus import LiveBus
+from soilbus.can.bus import SAY_AGAIN, LiveBus
 from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
@@ -151,6 +151,8 @@ class Service:
         self._next_watchdog = self._started
         self._health, self._fault = Health(self._started), ""
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
+        self._failing, self._is_said = "none", False
+        self._said: dict[str, float] = {}
 
     def _first_estimator(self) -> WindowEstimator:
         """In the worker: the estimator, with the posterior of the last run as its prior where one is stored."""
@@ -314,7 +316,9 @@ class Service:
             self._inputs_since = self._time.at(now)
         self._look_after_health(now)
         self._state = self._present_state(now)
-        if self._interruption(now) is not None or self.bus.counts.lost != self._lost:
+        interruption = self._interruption(now)
+        self._note_failing(interruption, now)
+        if interruption is not None or self.bus.counts.lost != self._lost:
             self._interrupted, self._lost = now, self.bus.counts.lost
         self._publish_ten_hertz(now)
         for message, due in self._due.items():
@@ -363,6 +367,28 @@ class Service:
         if self.intake.stale(present, self._inputs_since):
             return ServiceState.DEGRADED, f"overload frames are taken {present - read:.1f} s late"
         return None
+
+    def _note_failing(self, interruption: tuple[ServiceState, str] | None, now: float) -> None:
+        """Into the journal: inputs that fail and are back, each failure once in a while.
+
+        What the bus, its controller, another sender and a fault do is said where it is found.
+        """
+        reason = "none" if interruption is None else interruption[1]
+        kind = _first_word(reason)
+        if not self.intake.last_seen or not (kind in ("overload", "no_frames") or kind.startswith("input_")):
+            kind = reason = "none"
+        failing = kind if kind == "overload" else reason  # its text has figures
+        if failing == self._failing:
+            return
+        self._failing = failing
+        if failing == "none":
+            if self._is_said:
+                log.info("inputs are back")
+            self._is_said = False
+        elif now - self._said.get(failing, -math.inf) >= SAY_AGAIN:
+            self._said = {before: t for before, t in self._said.items() if now - t < SAY_AGAIN} | {failing: now}
+            self._is_said = True
+            log.warning("%s: no decision until it is back", reason)
 
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
         if (interruption := self._interruption(now)) is not None:
