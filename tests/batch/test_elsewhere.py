@@ -116,3 +116,13 @@ def test_a_dbc_that_no_server_has_is_one_line(address, url, tractor, tmp_path, c
     assert main(["batch", "--config", tractor, *command, "--scheduler", address]) == 2
     (said,) = capsys.readouterr().err.splitlines()
     assert f"dbc.input: {url}/none.dbc: no such file" in said
+
+
+def test_a_manifest_over_http_names_logs_beside_it(address, here, url, tractor, tmp_path):
+    (here / "fleet.csv").write_text("log,vehicle\nred/one.log,Tractor 7\n", encoding="utf-8")
+    command = ["batch", "--config", tractor, *SHORT, f"{url}/fleet.csv", "--out", str(tmp_path), "--scheduler", address]
+    assert main(command) == 0
+    windows = pd.read_parquet(tmp_path / "windows")
+    assert set(windows.log) == {f"{url}/red/one.log"}
+    assert set(windows.vehicle) == {"Tractor 7"}
+    assert len(windows) == 5
