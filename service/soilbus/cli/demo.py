@@ -58,12 +58,11 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
     `picture` is where the last state of the dashboard is kept as SVG; the engineer's page has `-engineer` in its name.
     """
     console = Console()
-    logging.getLogger("soilbus").setLevel(logging.ERROR)  # the dashboard shows what the service's journal says
     real = reference_configuration()
     recording = simulate(real, demo_scenario(duration), SEED)
     messages = _from_now_on(_every_second(frames(recording, real)))
     results: list[WindowResult] = []
-    with _bus_settings() as overrides:
+    with _bus_settings() as overrides, _without_journal():
         where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
         console.print(
             f"Simulated tractor on {where}: loam, then wet clay; {TIME_COMPRESSION:.0f} times as fast as real time."
@@ -90,6 +89,18 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
     if console.is_terminal:
         console.print(pictures["driver"])
     console.print("\n" + _story(results), highlight=False, end="")
+
+
+@contextmanager
+def _without_journal() -> Iterator[None]:
+    """The dashboard shows what the service's journal would say."""
+    journal = logging.getLogger("soilbus")
+    before = journal.level
+    journal.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        journal.setLevel(before)
 
 
 def _every_second(messages: Iterable[can.Message]) -> list[can.Message]:

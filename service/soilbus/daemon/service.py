@@ -388,7 +388,7 @@ class Service:
         elif now - self._said.get(failing, -math.inf) >= SAY_AGAIN:
             self._said = {before: t for before, t in self._said.items() if now - t < SAY_AGAIN} | {failing: now}
             self._is_said = True
-            log.warning("%s: no decision until it is back", reason)
+            log.warning("%s: no decision while it lasts", reason)
 
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
         if (interruption := self._interruption(now)) is not None:
