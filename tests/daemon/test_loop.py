@@ -228,7 +228,10 @@ def test_the_journal_says_which_input_fails_and_that_it_is_back(recording, caplo
     with caplog.at_level(logging.INFO, logger="soilbus.daemon.service"):
         bench.run(DURATION)
     failing = "input_stale load.FL load.FR load.RL load.RR: no decision while it lasts"
-    assert [r.getMessage() for r in caplog.records if r.getMessage().startswith("input")] == [failing, "inputs are back"]
+    assert [r.getMessage() for r in caplog.records if r.getMessage().startswith("input")] == [
+        failing,
+        "inputs are back",
+    ]
 
 
 def test_a_bus_on_which_nothing_was_heard_yet_is_no_failure(caplog):
