@@ -373,9 +373,10 @@ class Service:
 
         What the bus, its controller, another sender and a fault do is said where it is found.
         """
-        reason = "none" if interruption is None else interruption[1]
+        state, reason = interruption or (ServiceState.VALID, "none")
         kind = _first_word(reason)
-        if not self.intake.last_seen or not (kind in ("overload", "no_frames") or kind.startswith("input_")):
+        said_elsewhere = state in (ServiceState.WAITING, ServiceState.FAULT) or kind == "foreign_sender"
+        if said_elsewhere or not self.intake.last_seen:
             kind = reason = "none"
         failing = kind if kind == "overload" else reason  # its text has figures
         if failing == self._failing:
