@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import itertools
-import logging
 import math
 from collections import Counter
 from copy import copy
@@ -217,7 +216,7 @@ def test_losing_a_needed_stream_ends_go_within_its_timeout(recording, lost):
     assert str(bench.sent("SoilbusStatus")[-1]["State"]) == "degraded"
 
 
-def test_the_journal_says_which_input_fails_and_that_it_is_back(recording, caplog):
+def test_the_journal_says_once_a_minute_which_input_fails(recording, caplog):
     load = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
     start = recording[0].timestamp
 
@@ -225,12 +224,10 @@ def test_the_journal_says_which_input_fails_and_that_it_is_back(recording, caplo
         return 5.0 <= t - start < 9.0 or 12.0 <= t - start < 15.0
 
     bench = Bench([m for m in recording if m.arbitration_id != load or not is_lost(m.timestamp)])
-    with caplog.at_level(logging.INFO, logger="soilbus.daemon.service"):
-        bench.run(DURATION)
-    failing = "input_stale load.FL load.FR load.RL load.RR: no decision while it lasts"
-    assert [r.getMessage() for r in caplog.records if r.getMessage().startswith("input")] == [
-        failing,
-        "inputs are back",
+    bench.run(DURATION)
+    said = [record.getMessage() for record in caplog.records]
+    assert [text for text in said if "input" in text] == [
+        "input_stale load.FL load.FR load.RL load.RR: no decision while it lasts"
     ]
 
 

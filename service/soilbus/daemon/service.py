@@ -151,7 +151,7 @@ class Service:
         self._next_watchdog = self._started
         self._health, self._fault = Health(self._started), ""
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
-        self._failing, self._is_said = "none", False
+        self._failing = "none"
         self._said: dict[str, float] = {}
 
     def _first_estimator(self) -> WindowEstimator:
@@ -369,26 +369,20 @@ class Service:
         return None
 
     def _note_failing(self, interruption: tuple[ServiceState, str] | None, now: float) -> None:
-        """Into the journal: inputs that fail and are back, each failure once in a while.
+        """Into the journal: the inputs that fail first, each once in a while, and frames that are taken late.
 
         What the bus, its controller, another sender and a fault do is said where it is found.
         """
         state, reason = interruption or (ServiceState.VALID, "none")
-        kind = _first_word(reason)
-        said_elsewhere = state in (ServiceState.WAITING, ServiceState.FAULT) or kind == "foreign_sender"
-        if said_elsewhere or not self.intake.last_seen:
-            kind = reason = "none"
-        failing = kind if kind == "overload" else reason  # its text has figures
-        if failing == self._failing:
+        if state in (ServiceState.WAITING, ServiceState.FAULT) or reason == "foreign_sender":
+            reason = "none"
+        kind, *what = reason.split()
+        if kind == self._failing or not self.intake.last_seen:
             return
-        self._failing = failing
-        if failing == "none":
-            if self._is_said:
-                log.info("inputs are back")
-            self._is_said = False
-        elif now - self._said.get(failing, -math.inf) >= SAY_AGAIN:
-            self._said = {before: t for before, t in self._said.items() if now - t < SAY_AGAIN} | {failing: now}
-            self._is_said = True
+        self._failing = kind
+        first = " ".join((kind, *what[:1]))
+        if kind != "none" and now - self._said.get(first, -math.inf) >= SAY_AGAIN:
+            self._said[first] = now
             log.warning("%s: no decision while it lasts", reason)
 
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
