@@ -2,7 +2,8 @@
 
 Three parties share one bus: the tractor's ECUs (simulator) send, the service estimates, the dashboard reads only the
 service's frames. The bus is a vcan where the kernel has it, else python-can's in-process virtual bus. The simulated
-drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.
+drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.  Each
+frame carries the time at which it is due.
 
     soilbus demo --picture service/docs/dashboard.svg     draws the README's pictures: dashboard.svg, the driver's page
                                                           at the end of the drive, and dashboard-engineer.svg

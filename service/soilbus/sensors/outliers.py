@@ -1,6 +1,6 @@
 """Single outliers: readings that fit neither their noise nor the readings around them.
 
-    outlier    |y - line(t)| > max(6.5 sd, 3 q, 8 sd_v)
+    outlier    |y - line(t)| > max(a sd, b q, c sd_v)     a, b, c: outlier_sd, quartile_distances, vibrating_outlier_sd
 
 The line joins the medians of the four samples before and of the four after (Hampel identifier with the trend taken out;
 cf. Davies & Gather, J. Am. Stat. Assoc. 88, 1993, 782-792).  sd is the sensor's noise, q the distance of the quartiles

@@ -7,7 +7,7 @@ the value at one instant, not a mean over the bin, and does not depend on the ph
 model needs no second-order term.  It is a weighted sum of samples with the variance of that sum: it is worth fewer than
 n samples.
 
-The bin is the longest at which this loses at most MAX_LOSS of the n samples in each channel that the model needs, and
+The bin is the longest at which each channel that the model needs loses at most the share `max_loss` of its samples, and
 not shorter than the slowest of these channels' periods, at which every bin still has a sample.  Then a bin is short
 compared with the span over which a cubic fits within noise, and cubic interpolation between bins (for delays) has an
 error below the noise: at most 3/128 of the fourth difference.

@@ -408,7 +408,8 @@ SILENCES: Mapping[str, tuple[tuple[float, float], ...]] = {
 }  # fmt: skip
 """Times [s] at which channels say nothing, and for how long [s]."""
 SPIKES, SPIKE_SD = 0.01, (4.0, 16.0)
-"""Share of the samples that are spikes, and their sizes [sd of the sensor]."""
+"""Share [1] of the samples that are spikes, and their sizes [sd of the sensor]: a factor of about two on both sides of
+the limits of 6.5 and 8 sd, so that these decide."""
 
 
 class Heard(NamedTuple):
