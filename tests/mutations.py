@@ -37,7 +37,7 @@ DECISION = "tests/daemon/test_decision.py"
 MUTATIONS = (
     Mutation(
         "a window of before an interruption counts", "daemon/service.py",
-        "None if self._ended <= self._interrupted else self.result", "self.result",
+        "None if self._reached <= self._interrupted else self.result", "self.result",
         (f"{STORIES}::test_an_interruption_ends_what_was_known_before_it",),
     ),
     Mutation(

@@ -302,6 +302,22 @@ def test_an_outage_between_two_beats_ends_go_too(recording):
     assert str(bench.sent("Traversability")[-1]["State"]) == "go"
 
 
+@pytest.mark.parametrize("gone", [13.05, 13.25, 13.3, 13.35, 13.5])
+def test_a_window_that_ends_after_an_outage_but_whose_data_end_before_it_is_no_decision(recording, gone):
+    """The bus is back in time for the window's end at 14 s, and nothing was heard for 0.7 s."""
+    begin = recording[0].timestamp
+    bench = Bench([m for m in recording if not begin + gone <= m.timestamp < begin + gone + 0.7])
+    bench.run(gone)
+    bench.away = True
+    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    bench.run(0.7)
+    bench.away, back = False, bench.clock.now
+    bench.run(1.5)
+    known = [f for f in bench.sent("Traversability", since=back) if str(f["State"]) != "unknown"]
+    assert known
+    assert all(f["Age"] < f["at"] - back + 0.05 for f in known)  # in steps of 0.1 s
+
+
 def error_frame(t: float, error_class: int, *data: int) -> can.Message:
     return can.Message(timestamp=t, arbitration_id=error_class, is_error_frame=True, data=bytes(data).ljust(8, b"\0"))
 

@@ -139,6 +139,7 @@ class Service:
             lambda: self._guarded_estimator.estimator
         )  # where it raises, the first window does again, and says so
         self._ended = -math.inf  # monotonic time of the end of the present result's window
+        self._reached = -math.inf  # monotonic time of the last of its data
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
         self._inputs_since = -math.inf  # bus time since which inputs come in this epoch; -inf while there are none
@@ -280,9 +281,9 @@ class Service:
             self.bus.send(self.publisher.frame(message, values))
 
     def _vouched(self, result: WindowResult, ended: float, now: float) -> WindowResult:
-        """The result as it may go out: valid only if it is young and no input has failed since its window's end."""
+        """The result as it may go out: valid only if it is young and no input has failed since the last of its data."""
         is_old = not self._time.at(now) - result.basis.end <= self.config.traversability.max_age  # nor nan
-        is_over = ended <= self._interrupted or self._interruption(now) is not None
+        is_over = _reached(result, ended) <= self._interrupted or self._interruption(now) is not None
         if result.status is Status.VALID and (is_old or is_over):
             return replace(result, status=Status.DEGRADED)
         return result
@@ -299,7 +300,7 @@ class Service:
         last_failure = None if self.result is None else self.result.failure
         if result.termination is not None and result.failure not in (None, last_failure):
             log.warning("%s: solver ended by %s (%d)", result.failure, result.termination, result.iterations)
-        self.result, self._ended = result, ended
+        self.result, self._ended, self._reached = result, ended, _reached(result, ended)
         if result.curve is not None:
             self._curve = result.curve, result.t
 
@@ -391,7 +392,7 @@ class Service:
         ended = self._work_queue.oldest_end
         if ended is not None and now - ended > self.config.traversability.max_age:
             return ServiceState.DEGRADED, f"overload a window is not solved {now - ended:.1f} s after its end"
-        if self.result is None or self._ended <= self._interrupted:
+        if self.result is None or self._reached <= self._interrupted:
             return ServiceState.ESTIMATING, "none"
         reason = self.result.reason
         if self.result.gaps and reason.split()[0] in ("none", "model_mismatch"):
@@ -421,11 +422,11 @@ class Service:
         Returns
         -------
         The decision of the last window, judged at `now`; unknown while an input is stale or a fault holds, and until
-        a window has ended after the last interruption.
+        a window has data from after the last interruption.
         """
         if self._interruption(now) is not None:
             return Traversability()
-        result = None if self._ended <= self._interrupted else self.result
+        result = None if self._reached <= self._interrupted else self.result
         decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
         return at_present(decision, basis, self._loss, self._present_time(now), self.config, self._warned)
 
@@ -542,6 +543,11 @@ class Service:
             if beside is not None and (said := beside.status()):
                 text += f", {said}"
         self.notifier.status(text)
+
+
+def _reached(result: WindowResult, ended: float) -> float:
+    """Monotonic time [s] of the last of a window's data, where it has any, else of its end."""
+    return ended - (result.t - result.basis.end) if len(result.basis.instants) else ended
 
 
 def _first_word(reason: str) -> str:
