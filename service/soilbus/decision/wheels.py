@@ -41,8 +41,8 @@ MAX_SINE = 0.99
 """Sine of the steepest slope that is computed."""
 LOAD_RATIO = 0.9
 """Load, as a share of a wheel's own, of the second evaluation from which the second derivative by load follows."""
-ROLLING_SLIP, MAX_ROLLING_SKID = -0.05, 0.5
-"""Start of Newton's method for the slip of a wheel without torque, and the largest skid (minus slip) it may have."""
+MAX_ROLLING_SKID = 0.5
+"""Largest skid (minus slip) of a wheel without torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,8 @@ def wheel_table(
         start = None
     is_same = start is not None and start.axles.chassis == rig.chassis
     axles = start.axles if start is not None and is_same else Axles.of(rig, drives)
-    rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, ROLLING_SLIP)  # a track without thrust does not slip
+    first = rig.options.measurements.rolling_slip
+    rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, first)  # a track without thrust does not slip
     slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), rolling)
     if start is not None:
         pull, angle = _extrapolated(start, soils)

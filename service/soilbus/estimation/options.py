@@ -170,9 +170,6 @@ class PosteriorOptions:
     """Prior sd of a steady change of the soil in one window, in units of `drift` [1]; no evidence recorded."""
     knot_spacing: float = 1.0
     """Time [s] between two knots of the path's curvature; no evidence recorded."""
-    min_curvature_gain: float = 25.0
-    """Fall of -2 log posterior from which curvature at knots is accepted; noise alone makes about 9 in a window of
-    10 s."""
     form_stride: int = 4
     """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
     mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
@@ -190,11 +187,10 @@ class TrackerOptions:
     recorded."""
     settled_sd: float = 1.5
     """The same [sd] just after a border: its remains in the window bias the soil long before they are a mismatch."""
-    min_evidence_gain: float = 20.0
-    """Fall of -2 log evidence [1] by two soils instead of one from which the change is accepted, and of -2 log
-    posterior, beyond the number of residuals left out, from which these are part of the transition."""
-    max_scale_statistic: float = 25.0
-    """Score statistic [1], chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd."""
+    significance: float = 25.0
+    """Fall of -2 log evidence by two soils instead of one [1] from which the change is accepted; of -2 log posterior by
+    a longer transition, beyond the number of residuals left out, and by path curvature at knots; score statistic above
+    which sinkages are on a wrong scale: 5 sd of one unknown.  Curvature fits noise by about 9 in a window of 10 s."""
     min_rows_per_soil: int = 30
     """Residuals that each of two soils needs before they are compared; no evidence recorded."""
     min_to_detect: float = 0.3

@@ -92,7 +92,7 @@ def without_curvature(gaussian: Gaussian, curvature: PathCurvature) -> Gaussian:
 
 
 def detected_curvature(objective: Objective, fit: Fit | None) -> CurvedPath | None:
-    """Path curvature at knots, if it lowers -2 log posterior by more than `min_curvature_gain`.
+    """Path curvature at knots, if it lowers -2 log posterior by more than `TrackerOptions.significance`.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def detected_curvature(objective: Objective, fit: Fit | None) -> CurvedPath | No
     information = basis.T @ (own[:, None] * basis) - of_information + np.eye(len(std))
     amplitude = -np.linalg.solve(information, gradient)
     fall = -float(gradient @ amplitude)
-    if not fall > problem.options.posterior.min_curvature_gain:
+    if not fall > problem.options.tracker.significance:
         return None
     occam = float(np.linalg.slogdet(information)[1])
     return CurvedPath(knots_of(problem), amplitude * std, float(amplitude @ amplitude), occam)

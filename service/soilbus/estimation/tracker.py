@@ -552,7 +552,7 @@ class Tracker:
         if one is None or new is None or not one.converged:
             return new is not None
         gain = one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence
-        return gain >= self.options.min_evidence_gain
+        return gain >= self.options.significance
 
     def _another_soil(self, present: _Present, one: _Explanation) -> _Explanation:
         """The window as one soil, a new one where the prior of the present one conflicts with the data."""
@@ -578,7 +578,7 @@ class Tracker:
         if after is None or after.fit is None:
             return one
         fall = one.fit.neg2_log_posterior - after.fit.neg2_log_posterior - (one.fit.rows - after.fit.rows)
-        return after._replace(found=one.found or Reason.SPANS_BORDER) if fall > self.options.min_evidence_gain else one
+        return after._replace(found=one.found or Reason.SPANS_BORDER) if fall > self.options.significance else one
 
     def _search(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
         """A fit from many starts; None also where the budget allows no search."""
@@ -657,7 +657,7 @@ class Tracker:
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
-            off_scale = sinkages_off_scale(objective, fit, self.options.max_scale_statistic)
+            off_scale = sinkages_off_scale(objective, fit, self.options.significance)
             fit = with_nested_laplace(objective.problem, objective.coordinates.prior, objective.joint_prior, fit)
             fit = replace(fit, off_scale=off_scale)
         fit = replace(fit, form=self._form_posterior(objective, fit))

@@ -13,6 +13,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
+from soilbus.decision.wheels import MAX_ROLLING_SKID
 from soilbus.estimation.assembly import effects_of, model_of
 from soilbus.estimation.window import Rig, pairs
 from soilbus.terra.effects.steady import CompletedModel, Wheel
@@ -31,8 +32,6 @@ FIXED_POINT_ROUNDS = 5
 """Fixed-point rounds between draft and wheel loads, and to the loads that effects leave: both within a few per cent."""
 SLIP_STEP = 1e-4
 """Step of slip of the finite difference by which a free wheel's torque becomes zero."""
-ROLLING_SLIP_RANGE = -0.5, 0.0
-"""Slips that a free wheel may have."""
 
 
 def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
@@ -78,7 +77,7 @@ def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
             draft = pull.sum(axis=0)
         if not rig.drives.all():
             by_slip = (model.forces(state._replace(slip=state.slip + SLIP_STEP), rear, load)[2] - torque) / SLIP_STEP
-            slip = np.where(rig.drives[:, None], slip, np.clip(slip - torque / by_slip, *ROLLING_SLIP_RANGE))
+            slip = np.where(rig.drives[:, None], slip, np.clip(slip - torque / by_slip, -MAX_ROLLING_SKID, 0.0))
             state = state._replace(slip=slip)
     depth = model.sinkage(state.entry_angle, Wheel(radius, width, rear, load))
     speed = GROUND_SPEED / (radius * (1.0 - slip))
