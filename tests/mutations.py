@@ -47,12 +47,6 @@ MUTATIONS = (
          "test_a_window_that_ends_after_an_outage_but_whose_data_end_before_it_is_no_decision",),
     ),
     Mutation(
-        "short bins take values along lines", "sensors/bins.py",
-        "self.bin_length <= self.options.resolving", "False",
-        ("tests/sensors/test_bins.py::"
-         "test_a_swing_at_twice_the_bounce_is_known_at_the_centres_of_short_bins_whatever_the_phase_of_the_samples",),
-    ),
-    Mutation(
         "a posterior counts at any age", "decision/judgement.py",
         "now - basis.end <= settings.max_age and ", "",
         (f"{STORIES}::test_a_window_that_is_solved_when_it_is_too_old_is_no_go",),

@@ -51,34 +51,6 @@ def test_channels_as_fast_as_the_bins_have_their_own_samples():
     assert window.samples == 2 * len(t)
 
 
-def swinging(phase, noise, rng):
-    """Errors [sd of a sample] at the centres of bins of 0.04 s of a wheel speed at 50 Hz, 6 Hz, and the sd told."""
-    rig = rig_of(reference_configuration(["noise.speed={absolute=0.01, relative=0.0}"]))
-    store = Bins(rig, 0.04, 0.0)
-    t = np.arange(200) * 0.02 + phase
-    truth = lambda at: 2.0 + 0.5 * np.sin(2.0 * np.pi * 6.0 * at)  # noqa: E731
-    store.add({"speed.FL": (t, truth(t) + noise * 0.01 * rng.standard_normal(len(t)))})
-    window = store.window(0.0, 4.0)
-    inner = slice(2, -2)
-    off = (window.speed[:, 0] - truth(window.t))[inner]
-    return off, np.sqrt(window.variance["speed"][:, 0])[inner]
-
-
-@pytest.mark.parametrize("phase", [0.0005, 0.004, 0.0095, 0.013, 0.0195])
-def test_a_swing_at_twice_the_bounce_is_known_at_the_centres_of_short_bins_whatever_the_phase_of_the_samples(phase):
-    off, _ = swinging(phase, 0.0, np.random.default_rng(3))
-    assert np.abs(off).max() < 0.03 * 0.5  # along lines up to 0.19
-
-
-@pytest.mark.parametrize("phase", [0.004, 0.0095, 0.016])
-def test_values_at_the_centres_of_short_bins_are_as_certain_as_they_say(phase):
-    rng = np.random.default_rng(4)
-    smooth, _ = swinging(phase, 0.0, rng)
-    drawn = [swinging(phase, 1.0, rng) for _ in range(60)]
-    z = np.concatenate([(off - smooth) / sd for off, sd in drawn])
-    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.05)
-
-
 @pytest.mark.parametrize(
     ("machine", "overrides", "length"),
     [

@@ -3,18 +3,12 @@
     value(c) = mean(y) + slope * (c - mean(t))       c: centre of the bin, slope: between neighbouring bins
     variance = noise / (n w),  w = 1 / (1 + d^2 / 2)     n: samples, d: shift in bins, w: worth of a sample
 
-and in bins so short that they resolve how wheel loads shake (`ReceptionOptions.resolving`), by a cubic,
-
-    value(c) = sum_k l_k(c) y_k,  variance = noise sum_k l_k^2 / n_k     y_k: means of the four nearest half bins
-
-Sums and counts are kept by half bin and channel.  Each sample is added once, however many windows contain it.  A bin
-without a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins
-(`_bridged`).
+Sums and counts are kept by bin and channel.  Each sample is added once, however many windows contain it.  A bin without
+a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins (`_bridged`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -51,7 +45,7 @@ class Bins:
         self._index = {name: i for i, name in enumerate(rig.channels)}
         self._noise = NoiseTable.of(rig)
         self._first = 0
-        self._totals = np.zeros((3, 0, 2, len(self._index)))  # count, sum of values, sum of times; of half bins
+        self._totals = np.zeros((3, 0, len(self._index)))  # count, sum of values, sum of times
         self._recent: list[Samples] = []
         self._outliers: list[Array] = []
 
@@ -114,8 +108,8 @@ class Bins:
         low, high = (round((t - self.origin) / self.bin_length) - self._first for t in (start, end))
         return max(low, 0), max(high, 0)
 
-    def _bins(self, samples: Samples, parts: int = 1) -> NDArray[np.intp]:
-        return np.floor((samples.t / self.bin_length + 1e-9) * parts).astype(np.intp) - parts * self._first
+    def _bins(self, samples: Samples) -> NDArray[np.intp]:
+        return np.floor(samples.t / self.bin_length + 1e-9).astype(np.intp) - self._first
 
     def _taken(self, high: int) -> Samples:
         """Take the recent samples before bin `high` out of the store; those before the span are dropped."""
@@ -131,20 +125,19 @@ class Bins:
         """Totals with these samples added, at least up to the bin `high`; changed in place if long enough."""
         short = high - totals.shape[1]
         if short > 0:
-            totals = np.concatenate([totals, np.zeros((3, max(short, 64), *totals.shape[2:]))], axis=1)
+            totals = np.concatenate([totals, np.zeros((3, max(short, 64), totals.shape[2]))], axis=1)
         if not len(samples.t):
             return totals
-        halves = self._bins(samples, 2)
-        low = int(halves.min()) // 2
-        shape = high - low, *totals.shape[2:]
-        place = (halves - 2 * low) * shape[2] + samples.column
+        bins = self._bins(samples)
+        low = int(bins.min())
+        shape = high - low, totals.shape[2]
+        place = (bins - low) * shape[1] + samples.column
         for total, weights in zip(totals, (None, samples.value, samples.t), strict=True):
-            total[low:high] += np.bincount(place, weights, math.prod(shape)).reshape(shape)
+            total[low:high] += np.bincount(place, weights, shape[0] * shape[1]).reshape(shape)
         return totals
 
     def _made(self, totals: Array, low: int, high: int) -> Window:
-        halves = totals[:, low:high]
-        count, total, time = halves.sum(axis=2)
+        count, total, time = totals[:, low:high]
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, since = total / count, time / count
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
@@ -154,43 +147,7 @@ class Bins:
         for table, columns in zip((mean, since, count), bridged, strict=True):
             table[:, of_vehicle] = columns
         mean, worth = _at_centres(mean, since, centre)
-        effective = count * worth
-        if self.bin_length <= self.options.resolving:
-            _by_cubics(mean, effective, halves, centre)
-        return made_window(self._noise, self.origin + centre, mean, effective, samples)
-
-
-def _by_cubics(value: Array, effective: Array, halves: Array, centre: Array) -> None:
-    """Values at the bins' centres by cubics through the means of the four nearest half bins, where all have samples.
-
-    Parameters
-    ----------
-    value, effective
-        (N, channels), values at the centres and the number of samples that each is worth; changed in place.
-    halves
-        (3, N, 2, channels), count, sum of values and sum of times [s] of the half bins.
-    centre
-        (N,) [s].
-
-    Notes
-    -----
-    Wheels that share a torque slip in turn as their loads shake, at 1.5 to 3 Hz, and their torque at twice that: along
-    a line between neighbouring bins of 0.04 s the slope is up to a third too small.  A cubic through four samples
-    0.02 s apart is right to 2 %, and as certain as 1.6 samples.  Where times lie so that it would be worth less than
-    one sample, the line stays.
-    """
-    count, total, time = halves.reshape(3, -1, halves.shape[3])
-    near = 2 * np.arange(1, len(centre) - 1)[:, None] + np.arange(-1, 3)  # (N - 2, 4) half bins
-    n = count[near]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        away = centre[1:-1, None, None] - (time / count)[near]
-        weight = np.stack(
-            [np.prod([away[:, k] / (away[:, k] - away[:, j]) for k in range(4) if k != j], axis=0) for j in range(4)], 1
-        )
-        worth = 1.0 / (weight**2 / n).sum(axis=1)
-        at = (weight * (total / count)[near]).sum(axis=1)
-    better = worth >= 1.0
-    value[1:-1][better], effective[1:-1][better] = at[better], worth[better]
+        return made_window(self._noise, self.origin + centre, mean, count * worth, samples)
 
 
 def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Array:

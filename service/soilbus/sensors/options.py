@@ -26,9 +26,6 @@ class ReceptionOptions:
     by its own scatter."""
     vibrating_outlier_sd: float = 8.0
     """Distance from the line [sd of that scatter] from which a sample of such a channel is an outlier."""
-    resolving: float = 0.05
-    """Length of a bin [s] up to which values at its centre are by cubics: wheel loads shake at up to 3 Hz (Wong 2008,
-    ch. 7), torques behind a differential at twice that, and a cubic needs three bins a period."""
     max_loss: float = 0.1
     """Share [1] of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise."""
 
