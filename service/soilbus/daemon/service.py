@@ -5,7 +5,7 @@
     every tick     (10 Hz) wheel slip, immobilisation watch, decision -> frames; state, watchdog, state store
 
 No step of the loop waits for the estimator. The decision that goes out is valid only while inputs are fresh and no
-interruption (silent bus, stale input, foreign sender, fault) came after the end of the window that it rests on.
+interruption (silent bus, stale input, foreign sender, fault) came after the last of the data that it rests on.
 """
 
 from __future__ import annotations
