@@ -41,8 +41,6 @@ MAX_SINE = 0.99
 """Sine of the steepest slope that is computed."""
 LOAD_RATIO = 0.9
 """Load, as a share of a wheel's own, of the second evaluation from which the second derivative by load follows."""
-MAX_ROLLING_SKID = 0.5
-"""Largest skid (minus slip) of a wheel without torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,8 +228,10 @@ def wheel_table(
         start = None
     is_same = start is not None and start.axles.chassis == rig.chassis
     axles = start.axles if start is not None and is_same else Axles.of(rig, drives)
-    first = rig.options.measurements.rolling_slip
-    rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, first)  # a track without thrust does not slip
+    options = rig.options.measurements
+    rolling = np.where(
+        np.asarray(axles.length) > 0.0, 0.0, options.rolling_slip
+    )  # a track without thrust does not slip
     slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), rolling)
     if start is not None:
         pull, angle = _extrapolated(start, soils)
@@ -246,7 +246,7 @@ def wheel_table(
         angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.first.model, tolerance=1e-2)
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
-        now = _newton_step(soils, axles, completed, slips, pull, load, angle)
+        now = _newton_step(soils, axles, completed, slips, pull, load, angle, options.max_rolling_skid)
         for _ in range(MAX_NEWTON_STEPS - 1):
             rows = np.flatnonzero((now.step_size > last_step).any(axis=1))
             if not len(rows):
@@ -260,6 +260,7 @@ def wheel_table(
                 now.pull[rows],
                 now.load[rows],
                 angle[rows],
+                options.max_rolling_skid,
             )
             for whole, part in zip(now, _newton_step(*of_rows), strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
@@ -299,11 +300,19 @@ class _Step(NamedTuple):
 
 
 def _newton_step(
-    soils: Array, axles: Axles, model: ModelOfRows, slip: Array, pull: Array, load: Array, angle: Array
+    soils: Array,
+    axles: Axles,
+    model: ModelOfRows,
+    slip: Array,
+    pull: Array,
+    load: Array,
+    angle: Array,
+    max_skid: float,
 ) -> _Step:
     """One Newton step of entry angles, loads and pull.
 
-    A wheel that is not driven has torque T = 0, which is solved for its slip; so its slip follows its load.
+    A wheel that is not driven has torque T = 0, which is solved for its slip; so its slip follows its load; it skids by
+    `max_skid` at most.
     """
     forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)
     by_carried = np.stack([d.by_angle[1], d.by_angle[2], np.ones_like(d.by_angle[0])]) / d.by_angle[0]
@@ -327,7 +336,7 @@ def _newton_step(
     at[:2] += forces[1:]
     at[ANGLE] += angle
     step_size = np.maximum(np.abs(change), np.abs(step).max(axis=1))
-    slip = np.clip(slip - slower, -MAX_ROLLING_SKID, None)
+    slip = np.clip(slip - slower, -max_skid, None)
     return _Step(pull + change, load + shift, at, by_load, by_slip * axles.driven, slip, step_size)
 
 

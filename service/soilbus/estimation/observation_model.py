@@ -561,9 +561,10 @@ class ObservationModel(Measurements):
         rim = self.rig.radius[free] * latents.speed[:, free]
         ratio = latents.ground_speed[:, None] / rim  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
+        most = self.options.measurements.max_rolling_skid
         limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
         step = np.where(by_slip > 0.0, -at.value[1][:, free] / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
-        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -0.5, 0.0))
+        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""

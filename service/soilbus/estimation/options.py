@@ -47,6 +47,9 @@ class MeasurementOptions:
     rolling_slip: float = -0.03
     """Slip [1] of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1
     of the load takes a skid of 2 to 5 % on field soils (Wong 2008, fig. 2.60)."""
+    max_rolling_skid: float = 0.5
+    """Largest skid (minus slip) [1] of a wheel without torque that is tried on the way to T = 0: ten times what field
+    soils take, so that none of them is cut off."""
     slip_sd: float = 0.1
     """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is
     measured; no evidence recorded."""

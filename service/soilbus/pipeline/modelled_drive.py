@@ -13,7 +13,6 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
-from soilbus.decision.wheels import MAX_ROLLING_SKID
 from soilbus.estimation.assembly import effects_of, model_of
 from soilbus.estimation.window import Rig, pairs
 from soilbus.terra.effects.steady import CompletedModel, Wheel
@@ -77,7 +76,8 @@ def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
             draft = pull.sum(axis=0)
         if not rig.drives.all():
             by_slip = (model.forces(state._replace(slip=state.slip + SLIP_STEP), rear, load)[2] - torque) / SLIP_STEP
-            slip = np.where(rig.drives[:, None], slip, np.clip(slip - torque / by_slip, -MAX_ROLLING_SKID, 0.0))
+            rolled = np.clip(slip - torque / by_slip, -rig.options.measurements.max_rolling_skid, 0.0)
+            slip = np.where(rig.drives[:, None], slip, rolled)
             state = state._replace(slip=slip)
     depth = model.sinkage(state.entry_angle, Wheel(radius, width, rear, load))
     speed = GROUND_SPEED / (radius * (1.0 - slip))
