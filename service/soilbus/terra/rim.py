@@ -18,6 +18,8 @@ from soilbus.arrays import Array
 
 SERIES_TERMS = 10
 """Terms of the sine and cosine series: exact to rounding up to entry angles of pi/2."""
+NEWTON_STEPS = 5
+"""Of the angle where shear turns: exact to rounding up to entry angles of 1.2 rad, to 1e-6 rad beyond."""
 
 
 class Quadrature(NamedTuple):
@@ -98,21 +100,25 @@ def place_of_depth(theta: Array, depth: Any, peak: Any) -> Array:
 
 
 def _turning_angle(entry: Array, slip: Array, exit_ratio: Any) -> Array:
-    """Angle where the shear displacement of a skidding wheel is back at zero; nan if nowhere."""
+    """Angle a where the shear displacement of a skidding wheel is back at zero; nan if nowhere.
+
+    0 = ln(carry cos(m) sin(d) / d),    carry = 1 - slip,    m, d = (e +- a) / 2,    e: entry angle
+
+    which is the displacement e - a - carry (sin e - sin a) over e - a, so that the root is simple.  By Newton's method
+    in q = e^2 + e a + a^2, which to third order in the angles is 6 (1 - 1 / carry).
+    """
     carry = 1.0 - slip
-
-    def displacement(angle: Array) -> Array:
-        return np.asarray(entry - angle - carry * (np.sin(entry) - np.sin(angle)))
-
-    # The displacement peaks where carry cos(angle) = 1 and is zero once behind that.
-    high = np.where(carry * np.cos(entry) < 1.0, np.arccos(np.minimum(1.0 / carry, 1.0)), np.nan)
     low = exit_ratio * entry
-    high = np.where(displacement(low) < 0.0, high, np.nan)
-    for _ in range(50):
-        middle = (low + high) / 2.0
-        negative = displacement(middle) < 0.0
-        low, high = np.where(negative, middle, low), np.where(negative, high, middle)
-    return np.asarray((low + high) / 2.0)
+    turns = (carry * np.cos(entry) < 1.0) & (entry - low < carry * (np.sin(entry) - np.sin(low)))
+    q = 6.0 * (1.0 - 1.0 / carry)
+    for _ in range(NEWTON_STEPS):
+        angle = np.clip((np.sqrt(np.maximum(4.0 * q - 3.0 * entry**2, 1e-12)) - entry) / 2.0, low, entry)
+        middle, half = (entry + angle) / 2.0, (entry - angle) / 2.0
+        off = np.log(carry * np.cos(middle) * np.sinc(half / np.pi))
+        slope = np.tan(middle) - half / 3.0 * (1.0 + half**2 / 15.0 * (1.0 + 2.0 * half**2 / 21.0))  # 1 / d - cot d
+        step = np.clip(2.0 * (entry + 2.0 * angle) / slope, 3.0, 12.0)  # 6 for small angles
+        q = entry**2 + entry * angle + angle**2 + step * off
+    return np.where(turns, angle, np.nan)
 
 
 def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:
