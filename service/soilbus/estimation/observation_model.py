@@ -318,10 +318,6 @@ class ObservationModel(Measurements):
             With the latents eliminated: a step of soil and gains moves them as `updated` says.  Where latents are
             held, derivatives are taken there with the weights of the optimum, and they stay.
         """
-        at = self._linearised(soil, gains, latents, by_sensors)
-        return at if self.held is None else self._holding(at, self.held, by_sensors)
-
-    def _linearised(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool) -> Linearisation:
         layout = self.layout if by_sensors else Layout.of(self.n_wheels, 0)
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
         self.work.instants += self.n
@@ -372,7 +368,17 @@ class ObservationModel(Measurements):
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
-        inverse = self.inverse_covariance(A, variance, row_var)
+        if self.held is None:
+            inverse = self.inverse_covariance(A, variance, row_var)
+        else:
+            change, A, inverse = self.held.by_latents - A, self.held.by_latents, self.held.inverse
+            residual += (change @ (corrected - self.held.observed)[:, :, None])[:, :, 0]
+            if by_sensors:
+                by_gain[:, :, layout.latent_gains] -= change * latent_by_gain[:, None, :]
+            if len(by_delay):
+                by_effects += np.einsum("nml,pnl->nmp", change, by_delay)
+            corrected, by_delay = self.held.observed, by_delay[:0]
+            variance, latent_by_gain = np.zeros_like(variance), np.zeros_like(latent_by_gain)
         if by_sensors:
             # draft and inertia without their noise, which S^-1 r says: a gain times noise would fit better when smaller
             noise = (inverse[:, balance] * residual).sum(1)
@@ -421,27 +427,6 @@ class ObservationModel(Measurements):
         calm = copy(self)
         calm.held = HeldLatents(observed, by_latents, inverse)
         return calm, latents
-
-    def _holding(self, at: Linearisation, held: HeldLatents, by_sensors: bool) -> Linearisation:
-        """A linearisation with the derivatives by the latents and the weights of the optimum."""
-        change = held.by_latents - at.by_latents
-        rows = at.rows.reshape(*change.shape[:2], -1)
-        rows[:, :, RESIDUAL] += (change @ (at.corrected - held.observed)[:, :, None])[:, :, 0]
-        if by_sensors:
-            rows[:, :, self.layout.latent_gain_columns] -= change * at.by_gain[:, None, :]
-        if len(at.by_delay):
-            rows[:, :, -len(at.by_delay) :] += np.einsum("nml,pnl->nmp", change, at.by_delay)
-        weighed, zero = (held.inverse @ rows).reshape(at.rows.shape), np.zeros_like(at.variance)
-        return replace(
-            at,
-            weighed=weighed,
-            normal=at.rows.T @ weighed,
-            by_latents=held.by_latents,
-            corrected=held.observed,
-            variance=zero,
-            by_gain=zero,
-            by_delay=at.by_delay[:0],
-        )
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
         """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring.
@@ -853,7 +838,7 @@ class ObservationModel(Measurements):
 
     def _rolled(self, latents: Latents, soil: Soil) -> Latents:
         """The latents with the speeds and entry angles at which the free wheels need no torque, nearly."""
-        free, no_gains = self.rolls, np.zeros(self.n_sensors)
+        free, no_gains, tolerance = self.rolls, np.zeros(self.n_sensors), self.options.measurements.load_tolerance
         for _ in range(4):  # each linearisation adds one
             at = ObservationModel._response(self, soil, no_gains, latents)
             slip, speed, angle = self._rolling_slip(at, latents), latents.speed.copy(), latents.entry_angle.copy()
@@ -863,6 +848,9 @@ class ObservationModel(Measurements):
             factor = np.clip(1.0 + short / at.load_slope[:, free] / angle[:, free], 0.8, 1.25)
             angle[:, free] = np.minimum(angle[:, free] * factor, MAX_ENTRY_ANGLE)
             latents = Latents(latents.load, speed, latents.ground_speed, angle)
+            is_load = np.abs(short) <= tolerance * latents.load[:, free]
+            if (is_load & (np.abs(slip - before) <= tolerance * np.abs(slip))).all():
+                break
         return latents
 
     def thinned(self, max_instants: int) -> ObservationModel:
