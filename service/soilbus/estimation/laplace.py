@@ -34,12 +34,12 @@ import numpy as np
 
 from soilbus.arrays import Array, Indices
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
-from soilbus.estimation.multistart import Fit, fit_window, refine
+from soilbus.estimation.multistart import Fit, fit_at, fit_window, refine
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import PosteriorOptions
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective, coordinates_of
+from soilbus.estimation.solver import Iterate, Objective, coordinates_of, minimise
 
 _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
@@ -177,13 +177,16 @@ def profile_over_n(
         return None
     if not has_nodes or not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return ProfileOverN(denoised, top, [])
-    first = _node(denoised, prior, joint_prior, top, math.log(top.mode.soil[_N]), None)
-    if first is None:
+    objective, optimum = Objective(denoised, prior, joint_prior), top.optimum
+    approximation = objective.approximation_at(optimum)
+    mode = Iterate(optimum.soil, optimum.gains, optimum.latents)
+    first = _node(objective, mode, math.log(optimum.soil[_N]))
+    if approximation is None or first is None:
         return ProfileOverN(denoised, top, [])
-    step = min(math.sqrt(top.mode.covariance[_N, _N]), problem.options.posterior.first_node_step)
-    covariance = top.mode.covariance
-    slope = covariance[:, _N] / covariance[_N, _N]
-    down, up = (_one_side(denoised, prior, joint_prior, first, slope, sign * step) for sign in (-1.0, 1.0))
+    of_n = int(np.searchsorted(objective.free, _N))
+    along = approximation.covariance[:, of_n]
+    step = min(math.sqrt(along[of_n]), problem.options.posterior.first_node_step)
+    down, up = (_one_side(objective, first, along / along[of_n], sign * step) for sign in (-1.0, 1.0))
     return ProfileOverN(denoised, top, [*reversed(down), first, *up])
 
 
@@ -280,51 +283,51 @@ def _signed_root(u: Array, neg2_log: Array, fine: Array) -> Array:
     return np.asarray(np.interp(fine, u, sign * root))
 
 
-def _one_side(
-    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, top: Node, slope: Array, step: float
-) -> list[Node]:
+def _one_side(objective: Objective, top: Node, slope: Array, step: float) -> list[Node]:
     """Nodes on one side of the mode.
 
-    slope (6 + G,) is the change of the soil's logarithms and the gains per change of log n along the ridge;
+    slope (F + A,) is the change of the coordinates and active gains per change of log n along the ridge;
     step is the first change of log n, with its sign.
     """
     nodes: list[Node] = []
-    last, least, options = top, top.neg2_log_density, problem.options.posterior
-    while (node := _node(problem, prior, joint_prior, last.fit, last.u + step, slope)) is not None:
+    last, least, options = top, top.neg2_log_density, objective.problem.options.posterior
+    while (node := _node(objective, *_predicted(objective, last, slope, step))) is not None:
         nodes.append(node)
-        slope = (_logs_and_gains(node.fit) - _logs_and_gains(last.fit)) / (node.u - last.u)
+        slope = (_place(objective, node) - _place(objective, last)) / (node.u - last.u)
         last, least, step = node, min(least, node.neg2_log_density), step * options.node_step_growth
         if node.neg2_log_density > least + options.negligible:
             break
     return nodes
 
 
-def _node(
-    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, near: Fit, u: float, slope: Array | None
-) -> Node | None:
-    """The fit with log n held at u, from a fit nearby moved along the ridge; None beyond the bounds, or unconverged."""
-    soil, gains, n = near.optimum.soil.copy(), near.optimum.gains, math.exp(u)
-    if abs(u - math.log(prior.median[_N])) > problem.options.search.bound_sd * prior.log_std[_N]:
+def _predicted(objective: Objective, last: Node, slope: Array, step: float) -> tuple[Iterate, float]:
+    """The iterate a step of log n along the ridge from a node, with that slope (F + A,), and its log n."""
+    free, optimum, gains = len(objective.free), last.fit.optimum, last.fit.optimum.gains.copy()
+    place = _place(objective, last) + slope * step
+    soil = objective.coordinates.soil_at(place[:free])
+    gains[objective.active] = place[free:]
+    near = Iterate(optimum.soil, optimum.gains, optimum.latents)
+    return objective.moved(near, optimum.at, soil, objective.problem.allowed(gains)), last.u + step
+
+
+def _place(objective: Objective, node: Node) -> Array:
+    """Coordinates and active gains (F + A,) of a node."""
+    optimum = node.fit.optimum
+    return np.concatenate([objective.coordinates.position(optimum.soil), optimum.gains[objective.active]])
+
+
+def _node(objective: Objective, near: Iterate, u: float) -> Node | None:
+    """The fit with log n held at u, from an iterate near it; None beyond the bounds of n, or unconverged."""
+    prior, joint_prior, options = objective.coordinates.prior, objective.joint_prior, objective.options
+    if abs(u - math.log(prior.median[_N])) > options.bound_sd * prior.log_std[_N]:
         return None
-    if slope is not None:
-        predicted = _logs_and_gains(near) + slope * (u - math.log(soil[_N]))
-        free = prior.log_std > 0.0
-        soil[free] = coordinates_of(problem, prior).within(np.exp(predicted[:_SOIL]))[free]
-        gains = problem.allowed(predicted[_SOIL:])
-    soil[_N] = n
     median, log_std = prior.median.copy(), prior.log_std.copy()
-    median[_N], log_std[_N] = n, 0.0
-    objective = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
-    last = near.optimum
-    fit = refine(objective, objective.moved(Iterate(last.soil, last.gains, last.latents), last.at, soil, gains))
+    median[_N], log_std[_N] = math.exp(u), 0.0
+    held = Objective(objective.problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
+    fit = fit_at(held, minimise(held, near, options.along_n, 0.0))
     if fit is None or not fit.converged:
         return None
-    return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)
-
-
-def _logs_and_gains(fit: Fit) -> Array:
-    """Logarithms of the soil and gains (6 + G,) of an optimum."""
-    return np.concatenate([np.log(fit.optimum.soil), fit.optimum.gains])
+    return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + held.prior_factor.least_value)
 
 
 def _averaged(
