@@ -107,7 +107,7 @@ def test_the_diagnosis_knows_neither_effect_nor_soil():
             assert case.config.noise.torque.gain == (0.015 if kind == "hard" else 0.005)
 
 
-@pytest.mark.parametrize("kind", ["plain", "hard"])
+@pytest.mark.parametrize("kind", ["plain", "hard", "shaking"])
 def test_nothing_is_hidden_in_nulls(kind):
     nulls = list(cases(kind, 1))
     assert {(case.hidden, case.forms, case.size) for case in nulls} == {((), (), "")}
@@ -123,6 +123,14 @@ def test_harsh_drives_are_harsh():
         return list(cases(kind, 1))[:3]
 
     assert jerk("hard") > 4.0 * jerk("plain")
+
+
+def test_loads_shake_where_they_shall():
+    def swing(kind: str) -> float:
+        loads = [shorter(c, 20.0).recording.truth["load.RR"] for c in list(cases(kind, 1))[:3]]
+        return float(np.mean([np.std(np.diff(load) / load[1:]) for load in loads]))
+
+    assert swing("shaking") > 4.0 * swing("plain")
 
 
 @pytest.mark.parametrize("form", [*FORMS, *outside.FORMS], ids=titles((*FORMS, *outside.FORMS)))

@@ -38,8 +38,9 @@ __all__ = [
     "half_of",
 ]
 
-KINDS = ("single", "pair", "outside", "plain", "hard")
-"""One effect of the catalogue, two of them, one that it lacks, none, and none in harsh conditions."""
+KINDS = ("single", "pair", "outside", "plain", "hard", "shaking")
+"""One effect of the catalogue, two of them, one that it lacks, none, none in harsh conditions, and none on ground over
+which loads shake by SHAKING."""
 SOILS = (
     "loam", "wet_clay", "dry_sand", "clayey_soil_38", "upland_sandy_loam_51", "north_gower_clayey_loam_46",
     "rubicon_sandy_loam_43", "sandy_loam_11_michigan",
@@ -53,6 +54,8 @@ PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
 """Pairs that no diagnosis could distinguish from one of the two."""
 _HARSH = {"slowest": 0.15, "fastest": 0.40}
+SHAKING = 0.12
+"""Rms of a wheel's load over itself [1], as on the field vehicle."""
 
 
 @dataclass(frozen=True)
@@ -194,13 +197,13 @@ def _configured(kind: str, config: Config, soil: Soil, with_sinkage: bool, rng: 
 
 
 def _scenario(kind: str, soil: str, rng: np.random.Generator) -> Scenario:
-    """All slips from 0.05 to 0.4 over gentle slopes; hard: speed and slip swing fast."""
+    """All slips from 0.05 to 0.4 over gentle slopes; hard: speed and slip swing fast; shaking: loads do."""
     pace = _HARSH if kind == "hard" else {}
     x = np.cumsum(np.concatenate([[0.0], rng.uniform(12.0, 25.0, 20)]))
     slope = rng.uniform(-0.04, 0.04, len(x))
     return Scenario(
         DURATION, (Patch(0.0, soil),), speed=Swing(0.8, 2.0, **pace), slip=Swing(0.05, 0.40, **pace),
-        slope=tuple(zip(x.tolist(), slope.tolist(), strict=True)),
+        slope=tuple(zip(x.tolist(), slope.tolist(), strict=True)), bounce=SHAKING if kind == "shaking" else 0.0,
     )  # fmt: skip
 
 

@@ -77,7 +77,7 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
         yield _share("shown by this recording: named first", [first(t) == t.hidden[0] for t in can])
         yield _share("shown by this recording: in the set", [t.hidden[0] in in_set(t) for t in can])
         yield _share("shown by this recording: named otherwise", [first(t) not in ("", t.hidden[0]) for t in can])
-    for kind, most in (("plain", 0.03), ("hard", 0.10)):
+    for kind, most in (("plain", 0.03), ("hard", 0.10), ("shaking", 0.10)):
         nulls = [t for t in trials if t.kind == kind]
         yield _share(f"nulls, {kind}: falsely named", [bool(t.named) for t in nulls], most=most)
         yield _share(f"nulls, {kind}: falsely named or unknown", [t.verdict != "none" for t in nulls])
