@@ -97,7 +97,6 @@ class Layout(NamedTuple):
     draft_gain: int
     effects: slice
     sensor_columns: slice
-    latent_gain_columns: slice
     effect_columns: slice
 
     @classmethod
@@ -109,7 +108,7 @@ class Layout(NamedTuple):
             n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
             sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, n_sensors - 1),
             draft_gain=n_sensors - 1, effects=slice(n_sensors, None),
-            sensor_columns=slice(FIRST_GAIN, column), latent_gain_columns=slice(FIRST_GAIN + W, column - 1),
+            sensor_columns=slice(FIRST_GAIN, column),
             effect_columns=slice(column, None),
         )  # fmt: skip
 
