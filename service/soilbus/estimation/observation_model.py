@@ -60,6 +60,7 @@ from soilbus.terra.wheel import (
     sinkage,
     wheel_forces,
     wheel_forces_and_derivatives,
+    wheel_forces_and_slopes,
 )
 
 RESIDUAL = 0
@@ -542,13 +543,9 @@ class ObservationModel(Measurements):
         free = self.rolls
         if not free.any():
             return np.zeros((self.n, 0))
-        rim = self.rig.radius[free] * latents.speed[:, free]
-        ratio = latents.ground_speed[:, None] / rim  # 1 - slip
+        ratio = latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        most = self.options.measurements.max_rolling_skid
-        limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
-        step = np.where(by_slip > 0.0, -at.value[1][:, free] / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
-        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
+        return rolling_step(1.0 - ratio, at.value[1][:, free], by_slip, self.options.measurements.max_rolling_skid)
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
@@ -836,21 +833,35 @@ class ObservationModel(Measurements):
         return self._rolled(solved, soil) if self.rolls.any() else solved
 
     def _rolled(self, latents: Latents, soil: Soil) -> Latents:
-        """The latents with the speeds and entry angles at which the free wheels need no torque, nearly."""
-        free, no_gains, tolerance = self.rolls, np.zeros(self.n_sensors), self.options.measurements.load_tolerance
-        for _ in range(4):  # each linearisation adds one
-            at = ObservationModel._response(self, soil, no_gains, latents)
-            slip, speed, angle = self._rolling_slip(at, latents), latents.speed.copy(), latents.entry_angle.copy()
-            before = 1.0 - latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])
-            speed[:, free] = latents.ground_speed[:, None] / (self.rig.radius[free] * (1.0 - slip))
-            short = at.load_residual[:, free] - at.load_by_slip[:, free] * (slip - before)
-            factor = np.clip(1.0 + short / at.load_slope[:, free] / angle[:, free], 0.8, 1.25)
-            angle[:, free] = np.minimum(angle[:, free] * factor, MAX_ENTRY_ANGLE)
-            latents = Latents(latents.load, speed, latents.ground_speed, angle)
-            is_load = np.abs(short) <= tolerance * latents.load[:, free]
-            if (is_load & (np.abs(slip - before) <= tolerance * np.abs(slip))).all():
+        """The latents with the speeds and entry angles at which free wheels carry their loads without torque, nearly.
+
+        Newton's method in entry angle and slip, for load and torque; each linearisation adds a step.
+        """
+        free, options = self.rolls, self.options.measurements
+        radius, width, load = self.rig.radius[free], self.rig.width[free], latents.load[:, free]
+        state = WheelState(
+            latents.entry_angle[:, free], 1.0 - latents.ground_speed[:, None] / (radius * latents.speed[:, free]),
+            radius, width, lumped_modulus(soil.k_c, soil.k_phi, width), soil.n, np.tan(soil.phi), soil.c, soil.K,
+        )  # fmt: skip
+        for _ in range(4):
+            (carried, _, torque), ((slope, load_by_slip), _, (by_angle, by_slip)) = wheel_forces_and_slopes(
+                state, self.model
+            )
+            short, last = load - carried, state
+            slip = rolling_step(
+                state.slip, torque + by_angle / slope * short, by_slip - by_angle / slope * load_by_slip,
+                options.max_rolling_skid,
+            )  # fmt: skip
+            short -= load_by_slip * (slip - state.slip)
+            factor = np.clip(1.0 + short / slope / state.entry_angle, 0.8, 1.25)
+            state = state._replace(entry_angle=np.minimum(state.entry_angle * factor, MAX_ENTRY_ANGLE), slip=slip)
+            is_load = np.abs(short) <= options.load_tolerance * load
+            if (is_load & (np.abs(slip - last.slip) <= options.load_tolerance * np.abs(slip))).all():
                 break
-        return latents
+        speed, angle = latents.speed.copy(), latents.entry_angle.copy()
+        speed[:, free] = latents.ground_speed[:, None] / (radius * (1.0 - state.slip))
+        angle[:, free] = state.entry_angle
+        return Latents(latents.load, speed, latents.ground_speed, angle)
 
     def thinned(self, max_instants: int) -> ObservationModel:
         """The same window with at most `max_instants` of its usable instants, evenly spread."""
@@ -1236,6 +1247,13 @@ def _varied(soil: Soil) -> Soil:
     """The soil with derivatives by each parameter but k_c, whose derivative is that of k_phi over the width."""
     varied = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
     return soil._replace(**varied)  # type: ignore[arg-type]
+
+
+def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Array:
+    """Slips (N, F) of free wheels after one Newton step to no torque [N m]; most: greatest skid [1]."""
+    limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
+    step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
+    return np.asarray(np.clip(slip + np.clip(step, -limit, limit), -most, 0.0))
 
 
 def shrunk_latents(fitted: Array, variance: Array) -> Array:
