@@ -498,7 +498,7 @@ def _extrapolation(options: SolverOptions, here: _Expansion, last_step: Array, l
     """
     along = float(last_step @ here.model.information @ here.step) / here.model.squared_length(last_step)
     ratio = 1.0 - (1.0 - along) / last_fraction
-    if abs(ratio) <= options.slow_ratio or ratio >= 1.0:
+    if abs(ratio) <= options.slow_ratio:
         return 1.0
     return min(1.0 / max(1.0 - ratio, 1.0 / options.max_extrapolation), options.max_extrapolation)
 
