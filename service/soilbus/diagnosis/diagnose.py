@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from soilbus.allocator import keep_freed_memory
 from soilbus.diagnosis.delays import with_delays
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.fitted_model import FittedModel
@@ -118,6 +119,7 @@ def diagnose(
     NotFitted
         Where already the present model cannot be fitted.
     """
+    keep_freed_memory()
     progress("fitting the present model")
     options = records[0].options
     full = FitCache(records, prior, options)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.allocator import keep_freed_memory
 from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
@@ -102,6 +103,7 @@ class WindowEstimator:
     """
 
     def __init__(self, config: Config, tracker_of: Callable[..., Tracker] = Tracker) -> None:
+        keep_freed_memory()
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._gain_names, self._gain_std = gains_of(self.rig)
