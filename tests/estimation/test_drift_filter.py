@@ -98,7 +98,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
 
     # The same by dense systems: soil of piece 0, 1, ..., then gains, then a steady change or none.
     objective = Objective(problem, case.prior, before)
-    place = Iterate(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents)
+    place = Iterate.of(fit.optimum)
     at, directions = fit.optimum.at, objective.directions(place)
     free, kept = len(objective.free), directions.shape[1]
     known = objective.prior_at(place)

@@ -229,9 +229,8 @@ def wheel_table(
     is_same = start is not None and start.axles.chassis == rig.chassis
     axles = start.axles if start is not None and is_same else Axles.of(rig, drives)
     options = rig.options.measurements
-    rolling = np.where(
-        np.asarray(axles.length) > 0.0, 0.0, options.rolling_slip
-    )  # a track without thrust does not slip
+    # a track without thrust does not slip
+    rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, options.rolling_slip)
     slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), rolling)
     if start is not None:
         pull, angle = _extrapolated(start, soils)

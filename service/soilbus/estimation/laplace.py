@@ -177,10 +177,9 @@ def profile_over_n(
         return None
     if not has_nodes or not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return ProfileOverN(denoised, top, [])
-    objective, optimum = Objective(denoised, prior, joint_prior), top.optimum
-    approximation = objective.approximation_at(optimum)
-    mode = Iterate(optimum.soil, optimum.gains, optimum.latents)
-    first = _node(objective, mode, math.log(optimum.soil[_N]))
+    objective = Objective(denoised, prior, joint_prior)
+    approximation = objective.approximation_at(top.optimum)
+    first = _node(objective, Iterate.of(top.optimum), math.log(top.optimum.soil[_N]))
     if approximation is None or first is None:
         return ProfileOverN(denoised, top, [])
     of_n = int(np.searchsorted(objective.free, _N))
@@ -202,9 +201,7 @@ def attainable_variance(along: ProfileOverN, prior: SoilPrior, joint_prior: Gaus
     columns = np.searchsorted(objective.free, [_K_C, _N])
     variance = []
     for node in along.nodes:
-        optimum = node.fit.optimum
-        iterate = Iterate(optimum.soil, optimum.gains, optimum.latents)
-        model = objective.with_prior(iterate, optimum.at)
+        model = objective.with_prior(Iterate.of(node.fit.optimum), node.fit.optimum.at)
         inverse = None if model is None else solve_with_inverse(model.information, model.gradient)
         if inverse is None:
             return None
@@ -306,8 +303,8 @@ def _predicted(objective: Objective, last: Node, slope: Array, step: float) -> t
     place = _place(objective, last) + slope * step
     soil = objective.coordinates.soil_at(place[:free])
     gains[objective.active] = place[free:]
-    near = Iterate(optimum.soil, optimum.gains, optimum.latents)
-    return objective.moved(near, optimum.at, soil, objective.problem.allowed(gains)), last.u + step
+    near = objective.moved(Iterate.of(optimum), optimum.at, soil, objective.problem.allowed(gains))
+    return near, last.u + step
 
 
 def _place(objective: Objective, node: Node) -> Array:

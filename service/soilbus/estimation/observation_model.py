@@ -370,7 +370,7 @@ class ObservationModel(Measurements):
             rows[self._missing] = 0.0
         if self.held is None:
             inverse = self.inverse_covariance(A, variance, row_var)
-        else:
+        else:  # r + (A_held - A)(corrected - observed): linear in the latents about those that are held
             change, A, inverse = self.held.by_latents - A, self.held.by_latents, self.held.inverse
             residual += (change @ (corrected - self.held.observed)[:, :, None])[:, :, 0]
             if by_sensors:

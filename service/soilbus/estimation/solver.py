@@ -48,6 +48,11 @@ class Iterate:
     gains: Array
     latents: Latents
 
+    @classmethod
+    def of(cls, optimum: Optimum) -> Iterate:
+        """The end point of a fit."""
+        return cls(optimum.soil, optimum.gains, optimum.latents)
+
     def as_soil(self) -> Soil:
         """The soil by name."""
         return Soil(*self.soil.tolist())
@@ -337,7 +342,7 @@ class Objective:
     def approximation_at(self, optimum: Optimum) -> GaussianApproximation | None:
         """The linear model at an optimum, kept for the next call; None where its information is singular."""
         if self._approximation is None or self._approximation[0] is not optimum:
-            iterate = Iterate(optimum.soil, optimum.gains, optimum.latents)
+            iterate = Iterate.of(optimum)
             directions, prior = self.directions(iterate), self.prior_at(iterate)
             by_unknowns = directions.T @ optimum.at.normal
             solution = solve_with_inverse(

@@ -18,8 +18,6 @@ from soilbus.arrays import Array
 
 SERIES_TERMS = 10
 """Terms of the sine and cosine series: exact to rounding up to entry angles of pi/2."""
-NEWTON_STEPS = 5
-"""Of the angle where shear turns: exact to rounding up to entry angles of 1.2 rad, to 1e-6 rad beyond."""
 
 
 class Quadrature(NamedTuple):
@@ -111,7 +109,7 @@ def _turning_angle(entry: Array, slip: Array, exit_ratio: Any) -> Array:
     low = exit_ratio * entry
     turns = (carry * np.cos(entry) < 1.0) & (entry - low < carry * (np.sin(entry) - np.sin(low)))
     q = 6.0 * (1.0 - 1.0 / carry)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(5):  # exact to rounding up to entry angles of 1.2 rad, to 1e-6 rad beyond
         angle = np.clip((np.sqrt(np.maximum(4.0 * q - 3.0 * entry**2, 1e-12)) - entry) / 2.0, low, entry)
         middle, half = (entry + angle) / 2.0, (entry - angle) / 2.0
         off = np.log(carry * np.cos(middle) * np.sinc(half / np.pi))

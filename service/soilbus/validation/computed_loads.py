@@ -34,8 +34,10 @@ from soilbus.validation.windows import bins_of
 CELLS = ("cells", "axle cells", "none")
 """Load cells of the wheels, of the axles, of neither."""
 SOILS = ("loam", "clayey_soil_38")
-BOUNCES = (0.03, 0.12)
-"""Rms of a wheel's load about its steady one, over it: a smooth field, and one like the field vehicle's."""
+FIELD_BOUNCE = 0.12
+"""Rms of a wheel's load about its steady one, over it [1]: that of the field vehicle."""
+BOUNCES = (0.03, FIELD_BOUNCE)
+"""The same of a smooth field, and of one like the field vehicle's."""
 QUANTITIES = ("pressure", "tan phi", "n")
 
 

@@ -27,6 +27,7 @@ from soilbus.validation.blind import (
     vehicle_forms,
 )
 from soilbus.validation.blind.form import SIZES, Form, Hidden, Setting, together
+from soilbus.validation.computed_loads import FIELD_BOUNCE
 
 __all__ = [
     "DURATION",
@@ -40,7 +41,7 @@ __all__ = [
 
 KINDS = ("single", "pair", "outside", "plain", "hard", "shaking")
 """One effect of the catalogue, two of them, one that it lacks, none, none in harsh conditions, and none on ground over
-which loads shake by SHAKING."""
+which loads shake by FIELD_BOUNCE."""
 SOILS = (
     "loam", "wet_clay", "dry_sand", "clayey_soil_38", "upland_sandy_loam_51", "north_gower_clayey_loam_46",
     "rubicon_sandy_loam_43", "sandy_loam_11_michigan",
@@ -54,8 +55,6 @@ PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
 """Pairs that no diagnosis could distinguish from one of the two."""
 _HARSH = {"slowest": 0.15, "fastest": 0.40}
-SHAKING = 0.12
-"""Rms of a wheel's load over itself [1], as on the field vehicle."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,7 @@ def _scenario(kind: str, soil: str, rng: np.random.Generator) -> Scenario:
     slope = rng.uniform(-0.04, 0.04, len(x))
     return Scenario(
         DURATION, (Patch(0.0, soil),), speed=Swing(0.8, 2.0, **pace), slip=Swing(0.05, 0.40, **pace),
-        slope=tuple(zip(x.tolist(), slope.tolist(), strict=True)), bounce=SHAKING if kind == "shaking" else 0.0,
+        slope=tuple(zip(x.tolist(), slope.tolist(), strict=True)), bounce=FIELD_BOUNCE if kind == "shaking" else 0.0,
     )  # fmt: skip
 
 
