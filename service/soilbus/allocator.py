@@ -22,7 +22,7 @@ def keep_freed_memory() -> None:
     it is never touched, so it costs no memory, and elsewhere this does nothing.  Without it a process that fits
     window after window gives memory back after each evaluation and faults it in again: 54 times the page
     faults and 1.3 times the processor time of `soilbus montecarlo --windows 6`, 100 times and 1.3 times those of
-    `soilbus replay` for the rear-driven tractor.  Whatever estimates or diagnoses calls it.
+    `soilbus replay` for the rear-driven tractor.  Estimator and diagnosis call it.
     """
     _C.free(_C.malloc(31 * 2**20))
 

@@ -13,7 +13,8 @@ with c the confidence distribution and a >= 1 for its skewness (`longer_side`).
 At constant loads tyres of two widths measure two points of the pressure-sinkage curve, and k_c, k_phi and n
 are three unknowns.  The soils that fit lie along a curved ridge on which k_c rises and falls again while n only
 falls, and the covariance at the mode does not describe it.  So n is held at several values in turn and the
-fits are averaged (Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71:319, sect. 3).
+fits are averaged (Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71:319, sect. 3).  Each fit starts where the line
+through the last two leads in the coordinates of `parametrization`, in which the ridge is hardly curved.
 
 The density counts the volume of what the data leave open.  Where k_c may be close to zero that volume is large
 on the logarithm's scale, and soils with much k_c get less probability than their fit deserves.  That gives the
@@ -290,7 +291,7 @@ def _one_side(objective: Objective, top: Node, slope: Array, step: float) -> lis
     last, least, options = top, top.neg2_log_density, objective.problem.options.posterior
     while (node := _node(objective, *_predicted(objective, last, slope, step))) is not None:
         nodes.append(node)
-        slope = (_place(objective, node) - _place(objective, last)) / (node.u - last.u)
+        slope = (_position(objective, node) - _position(objective, last)) / (node.u - last.u)
         last, least, step = node, min(least, node.neg2_log_density), step * options.node_step_growth
         if node.neg2_log_density > least + options.negligible:
             break
@@ -298,16 +299,19 @@ def _one_side(objective: Objective, top: Node, slope: Array, step: float) -> lis
 
 
 def _predicted(objective: Objective, last: Node, slope: Array, step: float) -> tuple[Iterate, float]:
-    """The iterate a step of log n along the ridge from a node, with that slope (F + A,), and its log n."""
+    """Where the ridge leads from a node by linear extrapolation: an iterate, and its log n.
+
+    slope, step: as of `_one_side`.
+    """
     free, optimum, gains = len(objective.free), last.fit.optimum, last.fit.optimum.gains.copy()
-    place = _place(objective, last) + slope * step
-    soil = objective.coordinates.soil_at(place[:free])
-    gains[objective.active] = place[free:]
+    position = _position(objective, last) + slope * step
+    soil = objective.coordinates.soil_at(position[:free])
+    gains[objective.active] = position[free:]
     near = objective.moved(Iterate.of(optimum), optimum.at, soil, objective.problem.allowed(gains))
     return near, last.u + step
 
 
-def _place(objective: Objective, node: Node) -> Array:
+def _position(objective: Objective, node: Node) -> Array:
     """Coordinates and active gains (F + A,) of a node."""
     optimum = node.fit.optimum
     return np.concatenate([objective.coordinates.position(optimum.soil), optimum.gains[objective.active]])

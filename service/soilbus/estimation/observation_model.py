@@ -1250,7 +1250,7 @@ def _varied(soil: Soil) -> Soil:
 
 
 def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Array:
-    """Slips (N, F) of free wheels after one Newton step to no torque [N m]; most: greatest skid [1]."""
+    """Slips (N, F) of free wheels after one Newton step towards zero torque [N m]; most: greatest skid [1]."""
     limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
     step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
     return np.asarray(np.clip(slip + np.clip(step, -limit, limit), -most, 0.0))
