@@ -251,43 +251,55 @@ def test_the_entry_angle_carries_the_load(load, slip, name, guess):
         assert float(sinkage(found, R)) == pytest.approx(z, rel=1e-6)
 
 
-# Calculated by hand from the closed formulas of Bekker, Janosi & Hanamoto and Wong that stand in the head of
-# terra.track.  No worked example of Wong's book could be found in a public text, so inputs and results are ours.
+# Two vehicles of equal weight and contact area, a wide short track beside a narrow long one: the comparison of Wong,
+# Theory of Ground Vehicles, ch. 2, as we remember its inputs (no public text has them).  Calculated by hand from the
+# closed formulas of Bekker, Janosi & Hanamoto and Wong that stand in the head of terra.track.
 SANDY = Soil(k_c=4.37e3, k_phi=196.72e3, n=1.6, phi=math.radians(19.7), c=1.0e3, K=0.05)
-WEIGHT, WIDTH, LENGTH = 135e3, 1.0, 3.6
+WEIGHT = 135e3
 """Of a vehicle with two tracks: pressure 135 kN / 7.2 m2 = 18.75 kPa."""
+WIDE, LONG = (1.0, 3.6), (0.8, 4.5)
+"""Width and length of each track [m]."""
 
 
-def hand_calculated(slip: float) -> np.ndarray:
+def calculated(slip: float, track: tuple[float, float]) -> np.ndarray:
     """Load, thrust and resistance [N] of the vehicle."""
-    one = state_on(SANDY, np.nan, slip, 0.4, WIDTH, LENGTH)
+    one = state_on(SANDY, np.nan, slip, 0.4, *track)
     angle = entry_angle_for_load(WEIGHT / 2.0, one, WheelModel())
     W, DP, T = wheel_forces(one._replace(entry_angle=angle), WheelModel())
     return 2.0 * np.array([W, T / 0.4, T / 0.4 - DP])
 
 
-def test_resistance_of_a_vehicle_calculated_by_hand():
-    """p = 18.75 kPa; K_L = 4.37/1 + 196.72 = 201.09; z = (18.75/201.09)^(1/1.6) = 0.22699 m; R = 2 p z / 2.6."""
-    assert hand_calculated(0.1)[2] == pytest.approx(2.0 * 18.75e3 * 0.22699 / 2.6, rel=3e-5)
+@pytest.mark.parametrize(("track", "depth"), [(WIDE, 0.22699), (LONG, 0.22622)])
+def test_resistance_of_two_vehicles_calculated_by_hand(track, depth):
+    """p = 18.75 kPa; K_L = 4.37/b + 196.72; z = (p/K_L)^(1/1.6); R = 2 b p z / 2.6: 3.27 and 2.61 kN."""
+    assert calculated(0.1, track)[2] == pytest.approx(2.0 * track[0] * 18.75e3 * depth / 2.6, rel=3e-5)
 
 
 @pytest.mark.parametrize(
-    ("slip", "mobilised"),
-    [(0.05, 0.729812), (0.1, 0.861215), (0.2, 0.930556), (0.4, 0.965278), (0.6, 0.976852), (0.8, 0.982639)],
+    ("slip", "wide", "long"),
+    [
+        (0.05, 0.729812, 0.780246),
+        (0.1, 0.861215, 0.888903),
+        (0.2, 0.930556, 0.944444),
+        (0.4, 0.965278, 0.972222),
+        (0.6, 0.976852, 0.981481),
+        (0.8, 0.982639, 0.986111),
+    ],
 )
-def test_thrust_of_a_vehicle_calculated_by_hand(slip, mobilised):
-    """A c + W tan phi = 7.2 + 135 * 0.35805 = 55.54 kN, times 1 - (1 - exp(-72 s)) / (72 s)."""
-    assert hand_calculated(slip)[1] == pytest.approx(55.54e3 * mobilised, rel=2e-4)
+def test_thrust_of_two_vehicles_calculated_by_hand(slip, wide, long):
+    """A c + W tan phi = 7.2 + 135 * 0.35805 = 55.54 kN, times 1 - (1 - exp(-l s / K)) / (l s / K)."""
+    assert calculated(slip, WIDE)[1] == pytest.approx(55.54e3 * wide, rel=2e-4)
+    assert calculated(slip, LONG)[1] == pytest.approx(55.54e3 * long, rel=2e-4)
 
 
 def test_slip_that_a_draft_asks_by_root_finding():
     """Drawbar pull inverted by brentq on the hand formulas and on the model is the same slip."""
 
     def by_hand(slip: float) -> float:
-        u = slip * LENGTH / SANDY.K
+        u = slip * WIDE[1] / SANDY.K
         resistance = 2.0 * 18.75e3 * (18.75e3 / 201.09e3) ** (1.0 / 1.6) / 2.6
         strength = 7.2e3 + WEIGHT * math.tan(SANDY.phi)
         return strength * (1.0 - (1.0 - math.exp(-u)) / u) - resistance - 40e3
 
-    ours = brentq(lambda s: hand_calculated(s)[1] - hand_calculated(s)[2] - 40e3, 0.01, 0.9)
+    ours = brentq(lambda s: calculated(s, WIDE)[1] - calculated(s, WIDE)[2] - 40e3, 0.01, 0.9)
     assert ours == pytest.approx(brentq(by_hand, 0.01, 0.9), rel=1e-9)
