@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from soilbus.config.model import Traversability as Settings
-from soilbus.decision.hysteresis import ORDER, Held, settled
-from soilbus.decision.traversability import State, Status, state_of
+from soilbus.decision.traversability import ORDER, Held, State, Status, settled, state_of
 
 CONFIG = Settings()
 SURE_GO, SURE_CAUTION = (norm.cdf(norm.ppf(p) + CONFIG.hysteresis) for p in (CONFIG.go, CONFIG.no_go))

@@ -14,7 +14,7 @@ from soilbus.can.log_writer import write_log
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.estimation.posterior import Estimate
 from soilbus.offline.replay import replay
-from soilbus.pipeline.excitation import Excitation
+from soilbus.pipeline.determination import Excitation
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.configuration import configuration_warnings

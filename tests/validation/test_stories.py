@@ -61,7 +61,7 @@ def without_memory_of_epochs(monkeypatch):
 
 
 def with_any_status(monkeypatch):
-    monkeypatch.setattr("soilbus.decision.hysteresis.state_of", lambda p, status, settings: "go")
+    monkeypatch.setattr("soilbus.decision.traversability.state_of", lambda p, status, settings: "go")
 
 
 def with_the_verdict_of_the_run_before(monkeypatch):

@@ -1,5 +1,7 @@
 """Determination: whether a window determines the soil as far as the machine presses and shears it.
 
+    excitation   sd of draft and slip = sqrt(max(sample variance - mean noise variance, 0)):  load determines the
+                 bearing modulus, slip the shear strength
     load_range   lacks where  std p(z) > max_bearing_std p(z),   z: z_ref, within the depths that carry load
     slip_range   lacks where  std tan phi > max_tan_phi_std tan phi  and  std tau > max_tan_phi_std tau,
                  tau = c + p tan phi at the contact's own pressure p = W / (b l)
@@ -12,15 +14,52 @@ tan phi apart.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.config.model import Estimator
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.posterior import Estimate
-from soilbus.estimation.window import Rig
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import sinkage
 
-__all__ = ["contact_pressure", "lacking", "loaded_depths", "sinkage_range"]
+__all__ = ["Excitation", "contact_pressure", "excitation_of", "lacking", "loaded_depths", "sinkage_range"]
+
+
+class Excitation(NamedTuple):
+    """Mean and standard deviation of draft [N] and of the wheels' mean slip over a window, less the sensors' noise.
+
+    None where not known.
+    """
+
+    draft: float | None = None
+    draft_sd: float | None = None
+    slip: float | None = None
+    slip_sd: float | None = None
+
+
+def excitation_of(window: Window, rig: Rig, min_speed: float) -> Excitation:
+    """Excitation of a forward window; slip only where the ground speed exceeds min_speed [m/s]."""
+    ground = np.where(window.ground_speed > min_speed, window.ground_speed, np.nan)[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slip = np.where(rig.drives, slip_ratio(rig.radius, window.speed, ground), np.nan)
+        noise = window.variance["speed"] / window.speed**2 + window.variance["ground_speed"][:, None] / ground**2
+        noise *= (1.0 - slip) ** 2
+        wheels = np.isfinite(slip + noise).sum(axis=1)
+        mean = np.where(wheels > 0, np.nansum(slip, axis=1) / wheels, np.nan)
+        variance = np.nansum(noise, axis=1) / wheels**2
+    return Excitation(*_spread(window.draft, window.variance["draft"]), *_spread(mean, variance))
+
+
+def _spread(value: Array, variance: Array) -> tuple[float | None, float | None]:
+    known = np.isfinite(value) & np.isfinite(variance)
+    if np.count_nonzero(known) < 2:
+        return None, None
+    value, variance = value[known], variance[known]
+    return float(value.mean()), float(np.sqrt(max(value.var(ddof=1) - variance.mean(), 0.0)))
 
 
 def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:

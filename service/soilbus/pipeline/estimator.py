@@ -20,7 +20,6 @@ from soilbus.allocator import keep_freed_memory
 from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
-from soilbus.decision.hysteresis import Held, doubted, settled
 from soilbus.decision.immobilisation import (
     Alert,
     Warnings,
@@ -34,7 +33,7 @@ from soilbus.decision.immobilisation import (
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, bins_of_a_moment, idle, motions, observed, slope_felt
-from soilbus.decision.traversability import State, Status, Traversability
+from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
@@ -45,8 +44,7 @@ from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
-from soilbus.pipeline.determination import lacking, sinkage_range
-from soilbus.pipeline.excitation import excitation_of
+from soilbus.pipeline.determination import excitation_of, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import GapWatch, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of

@@ -15,7 +15,7 @@ from soilbus.decision.immobilisation import Warnings, Watch
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import Status, Traversability
-from soilbus.pipeline.excitation import Excitation
+from soilbus.pipeline.determination import Excitation
 from soilbus.pipeline.positions import Position
 
 if TYPE_CHECKING:
