@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
+from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_at
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.solver import Objective, minimise
+from soilbus.report.statement import doubt
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -74,6 +77,20 @@ def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
     assert again.neg2_log_evidence == pytest.approx(held.neg2_log_evidence, abs=0.1)
     (score,) = scores([record], PRIOR, held, [CATALOGUE["lugs"]])
     assert held.free_unheld[i].at(score.starts[0].gains[record.training.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
+
+
+def test_an_effect_that_explains_the_data_only_at_the_edge_of_its_range_is_doubted():
+    """Slip-sinkage greater than it may be; within its range it is named, and nothing is doubted."""
+    effect = CATALOGUE["slip_sinkage"]
+    lower = {"softening": 1.0, "exponent": 0.05, "dug": 0.1}
+    narrow = replace(effect, parameters=tuple(replace(p, high=lower[p.name]) for p in effect.parameters))
+    record = recorded(hidden=(Active(effect, {"exponent": 0.3, "softening": 0.0, "dug": 0.0}),))
+    within, beyond = (diagnose([record], PRIOR, [candidate]) for candidate in (effect, narrow))
+    assert within.verdict is Verdict.NAMED
+    assert doubt(within) is None
+    assert beyond.verdict is not Verdict.NAMED
+    assert "at the edge of what is possible" in (doubt(beyond) or "")
+    assert "slip_sinkage (exponent 0.05)" in (doubt(beyond) or "")
 
 
 def test_a_start_with_other_effects_has_those_that_are_new_absent(record):

@@ -155,7 +155,8 @@ def diagnose(
     imitation = shares_alone(full, base, present, additions)
     chances = [addition.probability for addition in additions]
     rows = min(before.rows, after.rows)
-    is_doubtful = bool(imitation) or not base.converged
+    names = [addition.effect.name for addition in additions]
+    is_doubtful = bool(imitation) or not base.converged or any(f.effect in names for f in present.at_limits)
     verdict = verdict_of(before.value, after.value, rows, chances, is_doubtful, options)
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()

@@ -128,6 +128,12 @@ class FittedModel:
         return tuple(effect.name for effect in self.effects)
 
     @property
+    def at_limits(self) -> tuple[Free, ...]:
+        """Parameters held at the edge of their range that is not where their effect is absent."""
+        of_edge = (f for f in self.free if f.std == 0.0 and f.value in (f.parameter.low, f.parameter.high))
+        return tuple(f for f in of_edge if f.value != f.parameter.neutral)
+
+    @property
     def neg2_log_evidence(self) -> float:
         """-2 log of the marginal likelihood of all data, up to a constant.
 

@@ -59,7 +59,8 @@ def verdict_of(
         Probability of each effect added.
     is_doubtful
         Whether the names are not to be trusted at any probability: the effects explain the data only together
-        (`diagnose.shares_alone`), or the present model's fit did not converge, so that every fall from it is too large.
+        (`diagnose.shares_alone`), one of them explains them only at the edge of its range, or the present model's fit
+        did not converge, so that every fall from it is too large.
     """
     if is_unexplained(before, after, rows, options):
         return Verdict.UNKNOWN

@@ -115,8 +115,9 @@ def no_places(diagnosis: Diagnosis) -> str:
 
 
 def doubt(diagnosis: Diagnosis) -> str | None:
-    """Why the names are doubtful: open fits, effects that explain the data only together; None where they are not."""
-    found = [text for text in (_not_converged(diagnosis), _imitation(diagnosis)) if text is not None]
+    """Why the names are doubtful: open fits, sizes at an edge, effects that explain the data only together; or None."""
+    reasons = _not_converged(diagnosis), _at_limits(diagnosis), _imitation(diagnosis)
+    found = [text for text in reasons if text is not None]
     return "to be doubted: " + "; ".join(found) if found else None
 
 
@@ -127,6 +128,17 @@ def _not_converged(diagnosis: Diagnosis) -> str | None:
     return (
         "the fit of the present model did not converge, so evidence and names are a list of what to check, no finding"
     )
+
+
+def _at_limits(diagnosis: Diagnosis) -> str | None:
+    """A size that is possible only just, and would be larger: the formula is bent to what the catalogue lacks."""
+    named = {addition.effect.name for addition in diagnosis.additions}
+    held = sorted(
+        {f"{f.effect} ({f.parameter.name} {f.value:g})" for f in diagnosis.completed.at_limits if f.effect in named}
+    )
+    if not held:
+        return None
+    return f"at the edge of what is possible, where something that the catalogue lacks may push it: {', '.join(held)}"
 
 
 def _imitation(diagnosis: Diagnosis) -> str | None:
