@@ -105,6 +105,15 @@ def test_the_predicted_separation_is_what_a_drive_then_adds():
         assert np.mean(gained[name]) == pytest.approx(predicted, abs=2.0 * 2.0 * np.sqrt(predicted / 2.0))
 
 
+def test_a_drive_that_leaves_no_doubt_is_planned():
+    """Probabilities of one to the last digit."""
+    found = ambiguous()
+    sure = replace(found, additions=tuple(replace(addition, temperature=1e-3) for addition in found.additions))
+    plan = what_to_drive(sure, CONFIG)
+    assert plan is not None
+    assert plan.expected_probability == 1.0
+
+
 def test_what_excites_determines_a_soil_better_than_steady_driving():
     found = what_excites(CONFIG, SOILS["loam"])
     assert found is not None

@@ -129,9 +129,9 @@ class FittedModel:
 
     @property
     def at_limits(self) -> tuple[Free, ...]:
-        """Parameters held at the edge of their range that is not where their effect is absent."""
+        """Sizes, which are zero where their effect is absent, that are held at the edge of their range."""
         of_edge = (f for f in self.free if f.std == 0.0 and f.value in (f.parameter.low, f.parameter.high))
-        return tuple(f for f in of_edge if f.value != f.parameter.neutral)
+        return tuple(f for f in of_edge if f.parameter.neutral == 0.0 and f.value != 0.0)
 
     @property
     def neg2_log_evidence(self) -> float:

@@ -12,6 +12,7 @@ and keeps what is best: one simulation for each pattern in place of one for each
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -165,7 +166,7 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
 
     def score(manoeuvre: Manoeuvre) -> float:
         found = _separations(diagnosis, config, manoeuvre, true)
-        return -math.log1p(-chance(found)) if found else -np.inf
+        return -math.log(max(1.0 - chance(found), sys.float_info.epsilon)) if found else -np.inf
 
     best = _best(config, score)
     if best is None:
