@@ -9,7 +9,8 @@ from pathlib import Path
 import soilbus
 from soilbus.validation.hop_trace import hop_trace
 
-LINE = re.compile(r"one hop enters (\d+) files, (\d+) functions, (\d+) calls of soilbus\n")
+COUNTS = r"(\d+) files, (\d+) functions, (\d+) calls of soilbus\n"
+LINES = re.compile(f"one hop enters {COUNTS}with its watch it enters {COUNTS}")
 
 
 def test_a_hop_enters_the_same_code_in_two_runs():
@@ -18,13 +19,13 @@ def test_a_hop_enters_the_same_code_in_two_runs():
     assert 0 < first.files < first.functions < first.calls
 
 
-def test_another_process_prints_the_same_counts_as_one_line():
+def test_another_process_prints_the_same_counts():
     program = [sys.executable, "-m", "soilbus.validation.hop_trace"]
     env = {**os.environ, "PYTHONPATH": str(Path(soilbus.__file__).parents[1])}
     text = subprocess.run(program, check=True, capture_output=True, text=True, env=env).stdout
-    found = LINE.fullmatch(text)
+    found = LINES.fullmatch(text)
     assert found is not None
-    assert tuple(map(int, found.groups())) == hop_trace()
+    assert tuple(map(int, found.groups())) == (*hop_trace(), *hop_trace(watched=True))
 
 
 def test_profiling_is_off_again_after_the_trace():

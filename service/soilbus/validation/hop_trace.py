@@ -7,7 +7,8 @@
 The reference tractor's simulated drive on loam goes through the service's own pipeline. The windows before the last
 are solved without a trace, so that caches are filled and the tracker follows its soil; the last one is solved under
 `sys.setprofile`, which reports every call of a Python function. The counts are a measure of how much a reader must
-follow, not of time.
+follow, not of time. The service itself estimates and decides each hop, and watches for immobilisation at 10 Hz beside
+it; replay does both in one (`watched`).
 
     python -m soilbus.validation.hop_trace
 """
@@ -16,12 +17,12 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, NamedTuple
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
@@ -46,13 +47,15 @@ class HopTrace(NamedTuple):
     calls: int
 
 
-def hop_trace(warm_hops: int = WARM_HOPS) -> HopTrace:
+def hop_trace(warm_hops: int = WARM_HOPS, watched: bool = False) -> HopTrace:
     """Trace one hop of the reference tractor's drive.
 
     Parameters
     ----------
     warm_hops
         Windows solved, one hop apart, before the one that is traced.
+    watched
+        Whether the watch of the hop's moments counts, too.
 
     Returns
     -------
@@ -68,6 +71,7 @@ def hop_trace(warm_hops: int = WARM_HOPS) -> HopTrace:
     duration = settings.window + (warm_hops + 1) * settings.hop
     database = load_databases(config)
     pipeline = Pipeline(config, database)
+    solve = pipeline.estimator.solve if watched else pipeline.estimator.solve_unwatched
     solved, due = 0, 0.0
     for message in frames(simulate(config, excited("loam", duration), SEED), config, database):
         pipeline.feed(
@@ -77,15 +81,15 @@ def hop_trace(warm_hops: int = WARM_HOPS) -> HopTrace:
             continue
         for task in pipeline.intake.due(message.timestamp):
             if solved == warm_hops:
-                return traced(pipeline.estimator, task)
-            pipeline.estimator.solve(task)
+                return traced(solve, task)
+            solve(task)
             solved += 1
         due = min(pipeline.next_end, message.timestamp + settings.hop)
     raise RuntimeError(f"the drive of {duration:g} s holds {solved} windows, not {warm_hops + 1}")
 
 
-def traced(estimator: WindowEstimator, task: WindowTask) -> HopTrace:
-    """Counts of one `WindowEstimator.solve` of a task."""
+def traced(solve: Callable[[WindowTask], object], task: WindowTask) -> HopTrace:
+    """Counts of one call of a method of `WindowEstimator` with a task."""
     calls: Counter[CodeType] = Counter()
 
     def enter(frame: FrameType, event: str, _: Any) -> None:
@@ -95,7 +99,7 @@ def traced(estimator: WindowEstimator, task: WindowTask) -> HopTrace:
     usual = sys.getprofile()
     sys.setprofile(enter)
     try:
-        estimator.solve(task)
+        solve(task)
     finally:
         sys.setprofile(usual)
     del calls[enter.__code__]
@@ -103,9 +107,10 @@ def traced(estimator: WindowEstimator, task: WindowTask) -> HopTrace:
 
 
 def main() -> None:
-    """Print the counts as one line."""
-    found = hop_trace()
-    print(f"one hop enters {found.files} files, {found.functions} functions, {found.calls} calls of soilbus")
+    """Print the counts without the watch and with it, a line each."""
+    for watched, title in ((False, "one hop"), (True, "with its watch it")):
+        found = hop_trace(watched=watched)
+        print(f"{title} enters {found.files} files, {found.functions} functions, {found.calls} calls of soilbus")
 
 
 if __name__ == "__main__":
