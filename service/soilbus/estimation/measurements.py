@@ -1,6 +1,6 @@
 """Measurements of a window as the observation model uses them: usable instants, values, variances, masks.
 
-    slip_w = 1 - V / (r_w omega_w)                   usable where min_slip < slip < max_slip, load > 0, V > min_speed
+    slip_w = 1 - V / (r_w omega_w)                   usable where |slip| < max_slip, load > 0, V > min_speed
     demand = draft + m (G sin(pitch) + dV/dt)        drawbar pull that the wheels must give, with its variance
 
 `Measurements` keeps the instants at which some wheel is usable: forward motion (`window.forward` mirrors reversing),
@@ -110,8 +110,7 @@ class Measurements:
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
-            turns = (rim_speed > 0.0) & (slip < self.options.measurements.max_slip)
-            turns &= slip > self.options.measurements.min_slip
+            turns = (rim_speed > 0.0) & (np.abs(slip) < self.options.measurements.max_slip)
             usable = straight[:, None] & (window.load > 0.0) & (turns | ~rig.drives)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))

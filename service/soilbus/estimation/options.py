@@ -27,9 +27,7 @@ class MeasurementOptions:
     """Which instants of a window are usable, and how their forces are computed."""
 
     max_slip: float = 0.98
-    """Slip [1] from which a wheel is unusable; no evidence recorded."""
-    min_slip: float = -1.0
-    """Slip [1] (braking) up to which a wheel is unusable; no evidence recorded."""
+    """Slip [1], driving or braking, from which a wheel is unusable: 1 is a wheel that spins on the spot."""
     cubic_selection_sd: float = 6.0
     """Sd of the noise by which cubics through ground speeds must differ from lines to be used; no evidence recorded."""
     load_tolerance: float = 0.02
@@ -117,7 +115,8 @@ class SearchOptions:
     """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it; no
     evidence recorded."""
     other_optimum_sd: float = 10.0
-    """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum; no evidence recorded."""
+    """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
+    are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""
     distinct_sd: float = 2.0
     """Mahalanobis distance [sd] of two optima from which they are two modes, and difference of their bearing pressure
     or tan phi [sd] from which a window is ambiguous; no evidence recorded."""

@@ -206,7 +206,7 @@ def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Ru
             "no_slip": ~np.isfinite(slip),
             "no_time": ~np.isfinite(t),
             "load_range": load <= 0.0,
-            "slip_range": (slip >= usable.max_slip) | (slip <= usable.min_slip),
+            "slip_range": np.abs(slip) >= usable.max_slip,
         }
     reasons = [next((reason for reason, at in faults.items() if at[i]), "") for i in range(n)]
     kept = np.flatnonzero([not reason for reason in reasons])
