@@ -9,7 +9,6 @@ from scipy.optimize import least_squares
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
-from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -201,18 +200,27 @@ def test_gains_are_named_in_the_order_of_their_columns(few):
 
 def test_acceleration_from_speed_and_its_variance():
     t = np.arange(0.0, 10.0, 0.1)
-    a, variance = differentiated_speed(t, 1.0 + 0.3 * t, np.full(100, 1e-4), MeasurementOptions())
-    assert a == pytest.approx(np.full(100, 0.3), abs=1e-12)
-    assert variance[50] == pytest.approx(1e-4 / (0.01 * 28), rel=1e-9)  # sum of squares of -3..3
-    rng = np.random.default_rng(0)
-    speed = 1.0 + 0.3 * np.sin(0.5 * t) + 0.01 * rng.standard_normal((400, 100))
-    found = np.stack([differentiated_speed(t, row, np.full(100, 1e-4), MeasurementOptions())[0] for row in speed])
-    miss = found - 0.15 * np.cos(0.5 * t)
-    assert miss[:, 10:90].std() == pytest.approx(np.sqrt(1e-4 / 0.28), rel=0.05)
+    a, variance = differentiated_speed(t, 1.0 + 0.3 * t, np.full(100, 1e-4))
+    assert a == pytest.approx(np.full(100, 0.3), abs=1e-9)
+    # Slope of a cubic by least squares through 29 samples: s_6 / (s_2 s_6 - s_4^2), s_k the sum of k-th powers.
+    s2, s4, s6 = (float((np.arange(-14.0, 15.0) ** k).sum()) for k in (2, 4, 6))
+    assert variance[50] == pytest.approx(1e-4 / 0.01 * s6 / (s2 * s6 - s4**2), rel=1e-9)
+    assert variance[0] > 10.0 * variance[50]
     # A jerk is not a precise acceleration.
     step = np.where(t < 5.0, 1.0, 2.0)
-    assert differentiated_speed(t, step, np.full(100, 1e-4), MeasurementOptions())[1][50] > 10.0 * variance[50]
-    assert (differentiated_speed(t[:2], step[:2], np.full(2, 1e-4), MeasurementOptions())[1] >= 1.0).all()
+    assert differentiated_speed(t, step, np.full(100, 1e-4))[1][50] > 10.0 * variance[50]
+    assert (differentiated_speed(t[:2], step[:2], np.full(2, 1e-4))[1] >= 1.0).all()
+
+
+@pytest.mark.parametrize(("swing", "rate"), [(0.3, 0.5), (0.8, 2.0)], ids=["easy", "harsh"])
+def test_the_variance_of_acceleration_from_speed_is_that_of_its_errors(swing, rate):
+    t, rng = np.delete(np.arange(0.0, 10.0, 0.1), [40, 41, 42]), np.random.default_rng(0)
+    true = swing * rate * np.cos(rate * t)
+    speed = 1.0 + swing * np.sin(rate * t) + 0.01 * rng.standard_normal((400, len(t)))
+    found, variance = np.swapaxes([differentiated_speed(t, row, np.full(len(t), 1e-4)) for row in speed], 0, 1)
+    z = (found - true) / np.sqrt(variance)
+    assert np.sqrt((z**2).mean()) == pytest.approx(1.0, abs=0.1)
+    assert np.abs(z.mean(axis=0)).max() < 0.5
 
 
 def test_rows_that_one_latent_swamps_have_a_finite_inverse():

@@ -26,13 +26,15 @@ PHASE_PARTS = 16
 class Curve(NamedTuple):
     """Values, slopes [1/s] and second derivatives [1/s^2] at ascending times t [s] (K,), cubics between them.
 
-    step [s] is the median one; half_width the number of samples on each side of a fitted cubic (0: not smoothed).
+    slope_gain [1/s^2]: variance of a slope over that of a sample.  step [s] is the median one; half_width the number of
+    samples on each side of a fitted cubic (0: not smoothed).
     """
 
     t: Array
     value: Array
     slope: Array
     second: Array
+    slope_gain: Array
     step: float
     half_width: int
 
@@ -65,7 +67,7 @@ class Curve(NamedTuple):
 
 
 class Series(NamedTuple):
-    """A channel's curve of least risk (slopes, low passes) and one with less bias (delays)."""
+    """A channel's curve of least risk (slopes, low passes) and one with less bias (delays, accelerations)."""
 
     smooth: Curve
     faithful: Curve
@@ -115,16 +117,28 @@ def _curve(t: Array, value: Array, half: int) -> Curve:
     steps = np.diff(t)
     step = float(np.median(steps)) if len(steps) else 0.0
     slope = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
-    unsmoothed = Curve(t, value, slope, np.zeros(len(t)), step, 0)
+    unsmoothed = Curve(t, value, slope, np.zeros(len(t)), _gradient_gain(t), step, 0)
     runs = np.split(np.arange(len(t)), np.flatnonzero(steps > 1.5 * step) + 1)  # where a sample is missing
     runs = [run for run in runs if len(run) > 2 * half]
     if not half or 2 * sum(map(len, runs)) < len(t):
         return unsmoothed
-    smooth, slope, second = value.copy(), slope.copy(), unsmoothed.second.copy()
+    smooth, slope, second, slope_gain = (a.copy() for a in (value, slope, unsmoothed.second, unsmoothed.slope_gain))
+    gain = (_cubics(half).weights[1] ** 2).sum(axis=1) / step**2
     for run in runs:
         smooth[run], by_step, twice = _smoothed(value[run], half)
         slope[run], second[run] = by_step / step, twice / step**2
-    return Curve(t, smooth, slope, second, step, half)
+        slope_gain[run] = gain[half]
+        slope_gain[run[:half]], slope_gain[run[len(run) - half :]] = gain[:half], gain[half + 1 :]
+    return Curve(t, smooth, slope, second, slope_gain, step, half)
+
+
+def _gradient_gain(t: Array) -> Array:
+    """Variance of the slope between an instant's neighbours, at times t (K,) [s], over that of a sample."""
+    if len(t) < 2:
+        return np.full(len(t), np.inf)
+    between = np.concatenate([t[:1], t, t[-1:]])
+    span = between[2:] - between[:-2]
+    return np.asarray(2.0 / np.maximum(span, np.finfo(float).tiny) ** 2)
 
 
 @cache

@@ -12,10 +12,9 @@ open differential is none of the residuals: it fixes how the two wheels share th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from copy import copy
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.local_cubics import Series, curve_of
-from soilbus.estimation.options import MeasurementOptions
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -273,9 +271,7 @@ class Measurements:
             if has_acceleration.any() or self.rig.specific_force:
                 known = known & has_acceleration
             else:
-                acceleration, acceleration_var = differentiated_speed(
-                    self.t, self.ground_speed, self.ground_speed_var, self.options.measurements
-                )
+                acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
             inertia = mass * (GRAVITY * np.sin(pitch) + acceleration)
             inertia_var = mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
             self.pitch = pitch
@@ -393,67 +389,23 @@ def wheel_rotation(t: Array, speed: Array) -> Array:
     return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def differentiated_speed(
-    t: Array, speed: Array, variance: Array, options: MeasurementOptions, half_width: int = 3
-) -> tuple[Array, Array]:
-    """Acceleration and its variance as slopes of the ground speed, by local polynomials.
+def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:
+    """Acceleration and its variance (N,) [m/s^2] as slopes of the ground speed's smooth curve.
 
     Parameters
     ----------
     t, speed, variance : Array
         Times [s], ground speeds [m/s] and variances of these, (N,).
-    options : MeasurementOptions
-        By how much cubics must differ from lines to be used.
-    half_width : int
-        Samples on each side of a line.
-
-    Returns
-    -------
-    acceleration, variance : Array
-        [m/s^2] and its square, (N,).
 
     Notes
     -----
-    Straight lines, unless cubics differ from them by more than noise: cubics follow harsh
-    driving and are noisier, lines then flatten every swing and the vehicle seems lighter than
-    it is.  The misfit adds to the variance, so that harsh driving does not pass for precise data.
+    What speeds near an instant miss the curve by counts as their noise where it is more: harsh driving is no precise
+    datum.
     """
-    n = len(t)
-    if n < 3:
-        return np.zeros(n), np.full(n, 1.0 if n else np.inf)
-    lines = _polynomial_slopes(t, speed, variance, half_width, 1)
-    if n < 2 * half_width + 3:
-        return lines.value, lines.variance
-    cubics = _polynomial_slopes(t, speed, variance, half_width + 1, 3)
-    difference = cubics.weights - np.pad(lines.weights, ((0, 0), (1, 1)))
-    noise = float((difference**2 * variance[cubics.near]).sum())
-    square = float(((cubics.value - lines.value) ** 2).sum())
-    use_cubics = square > noise * (1.0 + options.cubic_selection_sd * math.sqrt(2.0 * (half_width + 1) / n))
-    chosen = cubics if use_cubics else lines
-    return chosen.value, chosen.variance
-
-
-class _Slopes(NamedTuple):
-    """Slopes (N,) with variances; weights (N, 2 half_width + 1) of the speeds with indices `near`."""
-
-    value: Array
-    variance: Array
-    weights: Array
-    near: NDArray[np.intp]
-
-
-def _polynomial_slopes(t: Array, speed: Array, variance: Array, half_width: int, degree: int) -> _Slopes:
-    """Slope at each instant of the polynomial through it and its neighbours; fewer neighbours at the ends."""
-    n = len(t)
-    indices = np.arange(n)[:, None] + np.arange(-half_width, half_width + 1)
-    exists, near = (indices >= 0) & (indices < n), np.clip(indices, 0, n - 1)
-    powers = (t[near] - t[:, None])[:, :, None] ** np.arange(degree + 1) * exists[:, :, None]
-    fit = np.linalg.pinv(powers)  # (N, degree + 1, 2 half_width + 1), zero beyond the ends
-    values = speed[near]
-    misfit = np.where(exists, values - (powers @ (fit @ values[:, :, None]))[:, :, 0], 0.0)
-    count = exists.sum(axis=1)
-    spread = np.maximum(
-        (variance[near] * exists).sum(1) / count, (misfit**2).sum(1) / np.maximum(count - degree - 1, 1)
-    )
-    weights = fit[:, 1]
-    return _Slopes((weights * values).sum(1), spread * (weights**2).sum(1), weights, near)
+    if len(t) < 3:
+        return np.zeros(len(t)), np.full(len(t), 1.0)
+    curve = Series.of(t, speed, variance).faithful
+    near = np.ones(2 * max(curve.half_width, 1) + 1)
+    spread, noise = (np.convolve(a, near, "same") for a in ((speed - curve.value) ** 2, variance))
+    count = np.convolve(np.ones(len(t)), near, "same")
+    return curve.slope, np.maximum(spread, noise) / count * curve.slope_gain

@@ -28,8 +28,6 @@ class MeasurementOptions:
 
     max_slip: float = 0.98
     """Slip [1], driving or braking, from which a wheel is unusable: 1 is a wheel that spins on the spot."""
-    cubic_selection_sd: float = 6.0
-    """Sd of the noise by which cubics through ground speeds must differ from lines to be used; no evidence recorded."""
     load_tolerance: float = 0.02
     """Relative error of load [1] accepted in the first entry angles; each linearisation reduces it further."""
     max_side_load: float = 0.8
