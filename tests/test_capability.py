@@ -315,6 +315,13 @@ def test_first_order_is_exact_for_what_is_linear_and_blind_to_what_only_bends():
     assert mean > 7.0 + 0.5 * 5.0 * posterior.log_covariance[1, 1]
 
 
+def test_a_mean_that_is_not_known_has_no_std():
+    samples = np.full((9, 3), np.nan)
+    samples[:, 0], samples[:4, 1], samples[1:, 2] = np.arange(9.0), 2.0, 1.0
+    mean, std = mean_and_std(samples)
+    assert np.isfinite(mean).tolist() == np.isfinite(std).tolist() == [True, False, False]
+
+
 def test_a_point_without_a_value_is_mirrored():
     points = SigmaPoints.of(Posterior(SOILS["loam"], np.diag([0.04, 0.01, 0.0, 0.0, 0.0, 0.0])))
     samples = 1000.0 + 100.0 * np.log(points.soils[:, 0])

@@ -357,6 +357,44 @@ def test_a_log_of_an_unknown_format_is_refused_before_the_work(tractor, tmp_path
     )
 
 
+@pytest.mark.parametrize("suffix", [".db", ".mf4", ".txt", ".blf.gz"])
+def test_a_log_that_its_writer_would_lose_is_refused(suffix, tmp_path, capsys):
+    assert main(["simulate", "--log", str(tmp_path / f"x{suffix}"), "--duration", "2"]) == 1
+    assert "no format of a log is known by this ending" in lines(capsys)[1][0]
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_output_replaces_what_the_command_reads_or_writes_already(log, tractor, tmp_path, capsys):
+    recorded, link = tmp_path / "in.log", tmp_path / "link.log"
+    shutil.copy(log, recorded)
+    link.symlink_to(recorded)
+    before = recorded.read_bytes()
+    run = ["replay", "--config", str(tractor), str(recorded)]
+    for option, out in (("--json", recorded), ("--frames", link), ("--report", tractor)):
+        assert main([*run, option, str(out)]) == 1
+        assert lines(capsys)[1] == [f"soilbus: {out} is read by this command: name another file to write"]
+    twice = str(tmp_path / "w.csv")
+    assert main([*run, "--json", twice, "--table", twice]) == 1
+    assert lines(capsys)[1] == [f"soilbus: {twice} is named for two outputs"]
+    assert main(["diagnose", "--config", str(tractor), str(recorded), "--json", str(recorded)]) == 1
+    assert recorded.read_bytes() == before
+
+
+def test_a_machine_without_torque_or_without_ground_speed_says_so(log, tractor, tmp_path, capsys):
+    text = tractor.read_text()
+    for line, missing in ((r"(?m)^torque = .*\n", "wheels"), (r"(?m)^ground_speed = .*\n", "ground_speed")):
+        config = tmp_path / f"no-{missing}.toml"
+        config.write_text(re.sub(line, "", text, count=0 if missing == "wheels" else 1))
+        assert main(["replay", "--config", str(config), str(log)]) == 1
+        assert f"invalid: input_missing {missing}" in lines(capsys)[1][-1]
+
+
+def test_a_manoeuvre_takes_no_other_slope_or_draft(tmp_path, capsys):
+    for option in (["--slope", "5"], ["--draft", "100"], ["--speed", "2"]):
+        assert main(["simulate", "--manoeuvre", str(tmp_path / "m"), *option, "--log", str(tmp_path / "x.log")]) == 1
+        assert "--manoeuvre has its own pull, slopes and speeds" in lines(capsys)[1][0]
+
+
 def test_a_picture_asks_for_its_folder_before_the_demo(tmp_path, capsys):
     assert main(["demo", "--picture", str(tmp_path / "no/x.svg")]) == 1
     assert lines(capsys) == ([], [f"soilbus: {tmp_path / 'no/x.svg'}: no folder {tmp_path / 'no'}"])

@@ -59,6 +59,7 @@ def test_cells_that_are_missing_are_not_their_text(named):
         ("log,vehicle\n", "no row in it"),
         ("# fleet\nlog,vehicle\na.log,T1\n", "needs a column log; its columns are # fleet"),
         ("log,vehicle\na.log,T1\n,T2\n", "row 3 has no log"),
+        ("vehicle,log\nT1\nT2,a.log\n", "row 2 has no log"),
         ('log,vehicle\n"a.log,T1\n', "not a table that can be read"),
         ("log,start\na.log,inf\n", "start inf is neither"),
         ("log,vehicle\na.log," + "ü" * 50, "no name that a folder of results can have"),

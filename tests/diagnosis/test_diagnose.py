@@ -44,6 +44,17 @@ def test_a_share_of_the_change_is_doubted():
     assert found.soil_before(0).soil == before
 
 
+def test_a_parameter_held_at_zero_stays_known():
+    soil = LOAM._replace(c=0.0)
+    held = COVARIANCE.copy()
+    held[4] = held[:, 4] = 0.0
+    moved = soil._replace(k_phi=1.5 * soil.k_phi)
+    reported = diagnosis(Posterior(moved, held), Posterior(soil, held)).soil_after(0)
+    assert np.isfinite(reported.log_covariance).all()
+    assert reported.log_covariance[4, 4] == 0.0
+    assert reported.log_covariance[1, 1] > held[1, 1]
+
+
 def test_an_effect_whose_formula_is_doubted_more_leaves_more_in_proportion_to_its_probability():
     tyre, other = (soil_error_share(name) for name in ("tyre_deflection", "rut_recovery"))
     assert tyre > 4.0 * other

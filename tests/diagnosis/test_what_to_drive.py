@@ -126,6 +126,15 @@ def test_what_excites_determines_a_soil_better_than_steady_driving():
     assert driven == pytest.approx(expected.parameters()["n"].std, rel=0.5)
 
 
+@pytest.mark.parametrize("held", ["n", "phi", "K"])
+def test_what_excites_leaves_out_what_is_held(held):
+    config = reference_configuration([f"soil.{held}.std=0"])
+    found = what_excites(config, SOILS["loam"])
+    assert found is not None
+    assert max(found[0].slip) - min(found[0].slip) > 0.3
+    assert found[1].parameters()[held].std == pytest.approx(0.0, abs=1e-12)
+
+
 @pytest.mark.parametrize("hidden", [PUSH, MORE_LOSS], ids=["draft_offset", "drivetrain_loss"])
 def test_of_two_recordings_the_score_predicts_what_the_fit_then_finds(hidden):
     """Gains are shared: what the first recording has put into them is not lost at the second."""

@@ -56,6 +56,14 @@ def test_parameters_have_the_std_of_a_log_normal():
     assert estimates["c"].std == 0.0
 
 
+def test_what_is_open_has_a_std_that_is_a_number():
+    """Of a parameter at its bound, where the variance of its logarithm may be anything."""
+    posterior = Posterior(LOAM, np.diag([900.0, 4e3, 0.05, 0.02, 900.0, 0.3]))
+    stds = [estimate.std / estimate.value for estimate in posterior.parameters().values()]
+    assert np.isfinite([*stds, posterior.tan_phi().std]).all()
+    assert 7.0 < stds[0] == stds[1] < 100.0
+
+
 def test_strength_may_be_known_where_cohesion_and_friction_are_not():
     """On a line of one strength a change of c is made up for by tan phi."""
     pressure, tan = 4e4, np.tan(LOAM.phi)

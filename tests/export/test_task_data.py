@@ -148,7 +148,8 @@ def test_bounds_that_do_not_rise_are_refused():
 
 def test_windows_without_place_or_date_are_left_out_and_counted(windows, config, tmp_path):
     nowhere, undated = replace(windows[0], position=None), replace(windows[1], t=12.0)
-    assert write_task_data(tmp_path, [nowhere, undated, windows[2]], config) == 2
+    beyond = replace(windows[1], t=6.7e9)  # 2182: more days than a time log can number
+    assert write_task_data(tmp_path, [nowhere, undated, windows[2], beyond], config) == 3
     assert len(records(tmp_path)) == 1
 
 

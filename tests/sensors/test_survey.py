@@ -6,6 +6,7 @@ import math
 import re
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -438,6 +439,31 @@ def test_a_mistake_about_an_axle_or_a_free_wheel_is_named(override, says, rear_d
     found = beside(reference_configuration([override], path=REAR_DRIVE), rear_drive)
     assert [fault for fault in found.faults if says in fault] == found.faults[:1]
     assert len(found.faults) >= 1
+
+
+@pytest.mark.parametrize(
+    ("path", "names"),
+    [(TRACTOR, ("load.FL", "load.FR", "load.RL", "load.RR")), (REAR_DRIVE, ("motor_speed.rear", "speed.rear"))],
+)
+def test_sensors_that_read_zero_are_named(path, names):
+    """As those do that are not connected."""
+    config = reference_configuration(path=path)
+    recording = simulate(config, Scenario(30.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3)), 5)
+    channels = {n: replace(c, value=0.0 * c.value) if n in names else c for n, c in recording.channels.items()}
+    assert any(n in names for n in channels)
+    heard = [frame_of(message) for message in frames(replace(recording, channels=channels), config)]
+    assert beside(config, heard).faults
+
+
+def test_where_nothing_moves_load_its_cells_are_not_judged_by_it():
+    """A machine that tows nothing, with cells, without pitch and acceleration."""
+    config = reference_configuration()
+    signals = config.signals.model_copy(update={"draft": None, "pitch": None, "acceleration": None})
+    vehicle = config.vehicle.model_copy(update={"towing": "never"})
+    config = config.model_copy(update={"signals": signals, "vehicle": vehicle})
+    recording = simulate(config, Scenario(40.0, (Patch(0.0, "loam"),), bounce=0.05), 5)
+    found = beside(config, [frame_of(message) for message in frames(recording, config)])
+    assert not [fault for fault in found.faults if "load moves" in fault]
 
 
 def on_hills(path: Path, slope: Sequence[tuple[float, float]]) -> list[Frame]:

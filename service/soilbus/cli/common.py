@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,11 +61,22 @@ def reading_or_writing(path: Path) -> Iterator[None]:
         raise WorkError(f"{path}: {error}") from None
 
 
-def check_folders(*paths: Path | None) -> None:
-    """Long work asks first whether there is a place for what comes of it."""
-    for path in paths:
-        if path is not None and not path.parent.is_dir():
+def check_outputs(*written: Path | None, read: Iterable[Path] = ()) -> None:
+    """Long work asks first whether there is a folder for each file it writes, and that none is a file it reads."""
+    inputs, outputs = {os.path.realpath(path) for path in read}, set[str]()
+    for path in written:
+        if path is None:
+            continue
+        if not path.parent.is_dir():
             raise WorkError(f"{path}: no folder {path.parent}")
+        name = os.path.realpath(path)
+        if os.path.exists(name) and not os.path.isfile(name):
+            continue
+        if name in inputs:
+            raise WorkError(f"{path} is read by this command: name another file to write")
+        if name in outputs:
+            raise WorkError(f"{path} is named for two outputs")
+        outputs.add(name)
 
 
 def check_log_to_write(path: Path | None) -> None:
@@ -77,4 +89,4 @@ def check_log_to_write(path: Path | None) -> None:
         check_is_a_format(path)
     except ValueError as error:
         raise WorkError(str(error)) from None
-    check_folders(path)
+    check_outputs(path)

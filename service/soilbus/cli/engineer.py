@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from soilbus.allocator import loading
 from soilbus.cli.common import (
     WorkError,
-    check_folders,
     check_log_to_write,
+    check_outputs,
     configured,
     configured_or_reference,
     need_extra,
@@ -43,7 +43,7 @@ def replay(args: argparse.Namespace) -> None:
         from soilbus.report.windows import summary
 
     config = configured(args)
-    _check_outputs(args, config)
+    _check_files(args, config)
     if config.table is not None:
         if args.frames is not None:
             raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
@@ -173,7 +173,7 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
         say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
 
 
-def _check_outputs(args: argparse.Namespace, config: Config) -> None:
+def _check_files(args: argparse.Namespace, config: Config) -> None:
     """Ask before the work whether what the options for files need is there."""
     from soilbus.export.soil_map import check_position_is_mapped
 
@@ -189,7 +189,15 @@ def _check_outputs(args: argparse.Namespace, config: Config) -> None:
     if args.map is not None and args.map.suffix == ".gpkg":
         need_extra("pyogrio", "geo", "--map OUT.gpkg")
     check_log_to_write(args.frames)
-    check_folders(args.json, args.report, args.table, args.mcap, args.map, args.manoeuvre_out)
+    written = args.json, args.report, args.table, args.mcap, args.map, args.frames, args.manoeuvre_out
+    check_outputs(*written, read=_read_files(args, config))
+
+
+def _read_files(args: argparse.Namespace, config: Config) -> list[Path]:
+    """What replay and diagnose read: logs, configuration and DBCs."""
+    from soilbus.config.file import found_configuration
+
+    return [*args.logs, Path(found_configuration(args.config)), *map(Path, config.dbc.input)]
 
 
 def _need_plots() -> None:
@@ -215,7 +223,7 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.simulator.play import scenario_over
 
     check_log_to_write(args.log)
-    check_folders(args.truth)
+    check_outputs(args.truth, args.log)
     if args.truth is not None and args.truth.suffix == ".parquet":
         need_extra("pyarrow", "tables", "--truth OUT.parquet")
     config = with_effects(configured_or_reference(args), args.effect)
@@ -227,6 +235,8 @@ def simulate(args: argparse.Namespace) -> None:
         if config.tows_nothing and args.slope:
             scenario = replace(scenario, slip=None)  # which would make slopes of its own
         if args.manoeuvre is not None:
+            if args.draft is not None or args.slope or args.speed is not None:
+                raise ValueError("--manoeuvre has its own pull, slopes and speeds: leave out --draft, --slope, --speed")
             scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
         bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
     except (SimulationError, KeyError, ValueError, BusError) as error:
@@ -316,7 +326,7 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.report is not None:
         _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
-    check_folders(args.json, args.report, args.model_out, args.manoeuvre_out)
+    check_outputs(args.json, args.report, args.model_out, args.manoeuvre_out, read=_read_files(args, config))
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
@@ -355,7 +365,7 @@ def batch(args: argparse.Namespace) -> None:
     from soilbus.report.batch import batch_text
     from soilbus.report.progress import phases
 
-    check_folders(args.out)
+    check_outputs(args.out)
     check_out(args.out, args.resume or args.retry)
     try:
         parts = args.out / "parts" if args.resume or args.retry else None

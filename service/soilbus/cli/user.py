@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
+from soilbus.cli.common import WorkError, check_outputs, configured, configured_or_reference, need_extra
 from soilbus.files import write_text
 from soilbus.process import ENDING, say
 
@@ -28,7 +28,7 @@ def demo(args: argparse.Namespace) -> None:
     """`soilbus demo`: simulated tractor, service and dashboard."""
     from soilbus.cli.demo import run_demo
 
-    check_folders(args.picture)
+    check_outputs(args.picture)
     run_demo(args.duration, args.picture)
 
 
@@ -47,7 +47,7 @@ def init(args: argparse.Namespace) -> None:
     to_stdout = str(args.out) == "-"
     if not to_stdout and args.out.exists() and not args.force:
         raise WorkError(f"{args.out} is there already; --force replaces it")
-    check_folders(None if to_stdout else args.out)
+    check_outputs(None if to_stdout else args.out)
     dbcs = [located(Path(), str(path)) for path in args.dbc]
     try:
         database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in dbcs]}}))

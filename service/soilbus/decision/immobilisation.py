@@ -401,7 +401,7 @@ def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], bins: int, min_s
     window
         A forward window.
     rig
-        With a chassis, else there are no moments.
+        With a chassis and wheels, else there are no moments.
     chosen
         (M,), the bins at which each mean ends.
     bins
@@ -409,7 +409,7 @@ def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], bins: int, min_s
     min_speed
         [m/s], ground speed up to which slip is nan.
     """
-    if rig.chassis is None:
+    if rig.chassis is None or not rig.wheels:
         return
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)

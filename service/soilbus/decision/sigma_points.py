@@ -129,7 +129,7 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
     Returns
     -------
     mean, std
-        (...,) each, over the draws that have a value.  The mean is nan where the mode or most draws have none.
+        (...,) each, over the draws that have a value; nan where the mode or most draws have none.
     """
     change = samples[1:] - samples[0]
     known = np.isfinite(change)
@@ -140,7 +140,8 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
     of_count = 1.0 / np.maximum(count, 1)
     mean = np.where(known, change, 0.0).sum(axis=0) * of_count
     square = (np.where(known, change - mean, 0.0) ** 2).sum(axis=0) * of_count
-    return np.where(2 * count > len(change), samples[0] + mean, np.nan), np.sqrt(square)
+    is_known = np.isfinite(samples[0]) & (2 * count > len(change))
+    return np.where(is_known, samples[0] + mean, np.nan), np.where(is_known, np.sqrt(square), np.nan)
 
 
 def estimates(*samples: Array | None) -> list[Estimate | None]:

@@ -313,7 +313,7 @@ def motions(
     window
         A forward window.
     rig
-        With a chassis, else there are no motions.
+        With a chassis and wheels, else there are no motions.
     torque_limit
         (W,) [N m], nan where not known.
     settings
@@ -323,7 +323,7 @@ def motions(
     bins
         Over how many each mean goes, fewer at the window's begin.
     """
-    if not len(chosen) or rig.chassis is None:
+    if not len(chosen) or rig.chassis is None or not rig.wheels:
         return []
     drives, radius, weight = rig.drives, rig.radius, rig.chassis.mass * GRAVITY
     columns = np.column_stack(

@@ -91,7 +91,8 @@ class Diagnosis:
         """
         after, before = self.completed.fits[record].posterior, self.soil_before(record)
         share = max((addition.soil_error_share for addition in self.additions), default=0.0)
-        error = share * np.log(np.array(after.soil) / np.array(before.soil))
+        soil, base = np.array(after.soil), np.array(before.soil)
+        error = share * np.log(np.divide(soil, base, out=np.ones_like(base), where=base > 0.0))  # one held at 0 stays
         return Posterior(after.soil, after.log_covariance + np.outer(error, error))
 
 
@@ -158,6 +159,8 @@ def diagnose(
     names = [addition.effect.name for addition in additions]
     is_doubtful = bool(imitation) or not base.converged or any(f.effect in names for f in present.at_limits)
     verdict = verdict_of(before.value, after.value, rows, chances, is_doubtful, options)
+    if verdict is Verdict.UNKNOWN and not after.value < before.value:  # what explains nothing new is no name
+        additions, present, after, imitation = [], base, before, ()
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()
     if verdict is Verdict.NONE:

@@ -40,6 +40,10 @@ def effect_tables(fitted: FittedModel) -> tuple[list[dict[str, Any]], list[str]]
             notes.append(f"{effect.name} ({', '.join(left_out)}) describes the recording only and is left out")
         if kept:
             tables.append({"name": effect.name, **kept})
+    notes += [
+        f"{f.effect} is to be doubted: {f.parameter.name} = {f.value:g} is the edge of what is possible"
+        for f in fitted.at_limits
+    ]
     return tables, notes
 
 

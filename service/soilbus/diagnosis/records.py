@@ -132,6 +132,8 @@ def record_of(
     if min(map(len, parts)) < options.min_instants:
         raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
     training, held_out = (problem.part(part) for part in parts)
+    if not (training.n_rows and held_out.n_rows):
+        raise TooLittle(f"{name}: neither a torque nor a draft is known with its load, slip and slope at once")
     return Record(name, training, held_out, whole=problem, fold=fold, options=options)
 
 

@@ -58,9 +58,9 @@ class ResidualTerms:
 def residual_terms(records: Sequence[Record], fitted: FittedModel) -> list[ResidualTerms]:
     """Descriptions of what a fitted model leaves, one a channel, the one that explains most first."""
     found, options = [], records[0].options
-    names = records[0].training.row_channels
-    for column, (channel, wheel) in enumerate(names):
-        training, held_out = (_joined(list(part)) for part in zip(*_samples(records, fitted, column), strict=True))
+    for channel, wheel in dict.fromkeys(name for record in records for name in record.training.row_channels):
+        samples = _samples(records, fitted, (channel, wheel))
+        training, held_out = (_joined(list(part)) for part in zip(*samples, strict=True))
         if not len(training.z) or not len(held_out.z):  # a channel that is not there
             continue
         terms = _selected(training, options)
@@ -78,9 +78,14 @@ class _Sample(NamedTuple):
     regressors: dict[str, Array]
 
 
-def _samples(records: Sequence[Record], fitted: FittedModel, column: int) -> Iterator[tuple[_Sample, _Sample]]:
-    """Training and held-out sample of one residual column, for each recording."""
+def _samples(
+    records: Sequence[Record], fitted: FittedModel, channel: tuple[str, str]
+) -> Iterator[tuple[_Sample, _Sample]]:
+    """Training and held-out sample of one channel of a wheel, for each recording that has it."""
     for record, fit, check in zip(records, fitted.fits, fitted.checks, strict=True):
+        if channel not in record.training.row_channels:
+            continue
+        column = record.training.row_channels.index(channel)
         training = record.training.with_effects(fitted.effects, fitted.free)
         yield (
             _sample(training, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, column),

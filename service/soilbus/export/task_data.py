@@ -30,6 +30,8 @@ from soilbus.pipeline.result import WindowResult
 
 EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
 """Day 0 of a time log."""
+LAST_DAY = datetime(2159, 6, 6, tzinfo=UTC)
+"""Day 65535, the last one that it can write."""
 COMPACTION = 470
 """DDI "soil compaction" of ISO 11783-11."""
 FIRST_PROPRIETARY_DDI = 57344
@@ -82,7 +84,8 @@ def write_task_data(folder: Path, results: Iterable[WindowResult], config: Confi
         A file cannot be written.
     """
     every = list(results)
-    kept = [result for result in every if result.position is not None and result.t >= EPOCH.timestamp()]
+    first, last = EPOCH.timestamp(), LAST_DAY.timestamp()
+    kept = [result for result in every if result.position is not None and first <= result.t < last]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -154,7 +154,7 @@ def _opened(argument: str) -> AbstractContextManager[IO[bytes]]:
 def _entry(manifest: str, number: int, row: Mapping[str, Any]) -> dict[str, str]:
     """A row's texts; paths in it begin at the manifest's folder."""
     texts = {name: _cell(row[name]) for name in MANIFEST_COLUMNS if name in row}
-    if not texts["log"]:
+    if not texts.get("log"):
         raise BatchError(f"{manifest}: row {number} has no log")
     place, _, archive = place_of(manifest).partition("::")
     folder, is_remote = place.rpartition("/")[0], "://" in manifest

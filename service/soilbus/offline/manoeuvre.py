@@ -203,7 +203,10 @@ def what_excites(config: Config, soil: Soil) -> tuple[Manoeuvre, Posterior] | No
         if posterior is None:
             return -np.inf
         parameters, pressure = posterior.parameters(), posterior.bearing_pressure(settings.z_ref, settings.b_ref)
-        return -math.log(pressure.std * parameters["phi"].std * parameters["n"].std)
+        free = {name for name in parameters if config.soil_prior[name].std > 0.0}
+        stds = [parameters[name].std for name in ("phi", "n") if name in free]
+        stds += [pressure.std] if free & {"k_c", "k_phi", "n"} else []
+        return -sum(map(math.log, stds))
 
     found = _best(config, precision)
     posterior = None if found is None else expected(found[0])

@@ -359,7 +359,9 @@ class Intake:
         raw, self._implausible = self._consistency.checked(forward(bins.window(start, end)))
         window = completed(raw, self.rig)
         self.refusals.note_outliers(bins.new_outliers())
-        missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
+        missing = [c.name for c in self.needed if c.name not in self.last_seen]
+        missing += ["ground_speed"] if self._config.signals.ground_speed is None else []
+        missing += [] if self.rig.wheels else ["wheels"]
         covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < self._options.min_coverage]
         poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
@@ -369,7 +371,7 @@ class Intake:
             end=end,
             window=window,
             slip=self._slip(window),
-            missing=missing if self.rig.wheels else (*missing, "wheels"),
+            missing=tuple(missing),
             poor=poor,
             torque_limit=self._limits.at(end),
             track=self._positions.copy(),

@@ -285,7 +285,8 @@ def _expected(config: Config) -> tuple[float, float] | None:
     if posterior is None:
         return None
     bearing, tan_phi = posterior.bearing_pressure(s.z_ref, s.b_ref), posterior.tan_phi()
-    return bearing.std / bearing.value, tan_phi.std / tan_phi.value
+    of_bearing, of_tan_phi = (e.std / e.value if e.std else 0.0 for e in (bearing, tan_phi))  # a held one may be 0
+    return of_bearing, of_tan_phi
 
 
 def effect_lines(config: Config) -> list[str]:

@@ -166,7 +166,8 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
         _gear(facts, assignment, place, motor[moving], wheel[moving])
         own_speed = asserted.get(Slot("speed", place))
         if own_speed is not None and own_speed.dimension == "rotation":
-            _keep(facts.radius, place, np.abs(ground / wheel)[moving])
+            turning = moving & (wheel != 0.0)
+            _keep(facts.radius, place, np.abs(ground[turning] / wheel[turning]))
     _pool(facts.gear_ratio)
     for slot, c in asserted.items():
         if slot.role in ("speed", "motor_speed", "torque"):
@@ -230,6 +231,8 @@ def _sign(facts: Facts, c: Candidate, value: Array) -> None:
 
 def _kind(acceleration: Array, ground: Array, pitch: Array) -> str:
     """kinematic or specific_force, "" where the slope varies too little to say."""
+    if len(ground) < LEAST_BINS:
+        return ""
     width = round(1.0 / BIN)
     slope = _smooth(pitch, width)
     rest = _smooth(acceleration, width) - np.gradient(_smooth(ground, width), BIN)

@@ -383,7 +383,7 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
     drives = float(np.ptp(moving)) if len(moving) else 0.0
     for s in seen:
         quantity, name = s.channel.quantity, s.channel.name
-        if quantity in ("torque_limit", *POSITION_ROLES) or s.count < 50:
+        if quantity in ("torque_limit", LOCK, *POSITION_ROLES) or s.count < 50:
             continue
         _, value = heard[name]
         unit = SI.get(_dimension(s.channel), "")
@@ -525,6 +525,9 @@ def _transfer(facts: Facts) -> Iterator[Finding]:
     if len(rows) < 40 * block:
         return
     y, x = _blocks(rows, block).T
+    lever = max(chassis.hitch_height, chassis.cg_height) / chassis.wheelbase
+    if x.std() < LIMITS.excited * chassis.mass * GRAVITY * lever:
+        return
     (share,), (sd,) = _regression(y, x[:, None])
     if share < LIMITS.transfer - LIMITS.side_sd * sd:
         yield Finding(
@@ -533,6 +536,11 @@ def _transfer(facts: Facts) -> Iterator[Finding]:
             True,
             tuple(cells),
         )
+
+
+def _log_off(ratio: float) -> float:
+    """How far a ratio is from one, as a logarithm; infinite where a channel reads nothing, or below it."""
+    return abs(math.log(ratio)) if ratio > 0.0 else math.inf
 
 
 def _why_weight(ratio: float) -> str:
@@ -546,7 +554,7 @@ def _why_weight(ratio: float) -> str:
         (2.0, "does each load cell read a whole axle?"),
         (0.5, "does a load cell read only half of its wheel's load?"),
     ):
-        if abs(math.log(ratio / factor)) < 0.04:
+        if _log_off(ratio / factor) < 0.04:
             return why
     return "which of them is wrong? (ballast, unit or scale of the loads)"
 
@@ -586,7 +594,7 @@ def _gears(facts: Facts) -> Iterator[Finding]:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
         own = next(w for w in facts.config.wheel if w.name == wheel)
-        if not math.isfinite(ratio) or abs(math.log(max(ratio, 1e-9))) < LIMITS.gear or own.motor_speed is None:
+        if not math.isfinite(ratio) or _log_off(ratio) < LIMITS.gear or own.motor_speed is None:
             continue
         if f"motor_speed.{wheel}" not in facts.mapped and abs(own.gear_ratio * ratio - 1.0) < LIMITS.gear:
             continue
@@ -616,7 +624,7 @@ def _axle_gears(facts: Facts) -> Iterator[Finding]:
         if ratio < 0.0:
             text = f"axle.{axle.name}.motor_speed: turns backward while its wheels turn forward: sign = -1?"
             yield Finding(text, True, channels)
-        elif math.isfinite(ratio) and abs(math.log(ratio)) > LIMITS.gear:
+        elif math.isfinite(ratio) and _log_off(ratio) > LIMITS.gear:
             yield Finding(
                 f"axle.{axle.name}.gear_ratio = {axle.gear_ratio:g}, but {axle.motor_speed.signal} turns"
                 f" {axle.gear_ratio * ratio:.4g} times as fast as the mean of its wheels: {_why_gear(facts, names)}",
@@ -734,8 +742,8 @@ def _balance(facts: Facts) -> Iterator[Finding]:
         return
     if median(thrust) > LIMITS.most_thrust * weight:
         yield Finding(
-            f"the wheels thrust with {median(thrust) / 1e3:.0f} kN, more than soil can hold under"
-            f" {weight / 1e3:.0f} kN: gear_ratio too large, torques measured at the other side of the gear"
+            f"the wheels thrust with {median(thrust) / 1e3:.3g} kN, more than soil can hold under"
+            f" {weight / 1e3:.3g} kN: gear_ratio too large, torques measured at the other side of the gear"
             " (`at`), or their unit or byte order?",
             True,
             torques,
@@ -849,7 +857,8 @@ def _sides(facts: Facts) -> Iterator[Finding]:
             continue
         y, x = _blocks(y[known][:, None], per_block)[:, 0], _blocks(x[known], per_block)
         factors, sd = _regression(y, np.column_stack([x, np.ones(len(x))]))
-        of_load, of_slip = (factors < -LIMITS.side_sd * sd)[:2]
+        has_loads = {f"load.{name}" for name in names} <= facts.mapped  # else what shakes is in torques and slips alone
+        of_load, of_slip = (factors < -LIMITS.side_sd * sd)[:2] & has_loads
         swapped = f"{names[0]} and {names[1]} are swapped: the wheel with more"
         wheels = tuple(f"{q}.{w}" for q in ("load", "speed", "torque") for w in names)
         if of_load and of_slip:
