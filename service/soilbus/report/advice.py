@@ -39,7 +39,7 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
         case "not_excited" | "ambiguous":
             return _vary(windows, valid)
         case "standstill":
-            return "the vehicle stood or crept, or its wheels slipped beyond traversability.max_slip: drive on, with less pull"
+            return "the vehicle stood or crept, or slipped beyond traversability.max_slip: drive on, with less pull"
         case "turning":
             return "the vehicle turned, so its wheels have no common ground speed: drive straight"
         case "input_missing":
