@@ -138,6 +138,13 @@ def test_every_frame_is_on_the_engineers_page_and_gone_when_it_is_stale(desk, si
     assert [words for said in SAID.values() for words in said if re.search(words, text)] == []
 
 
+def test_a_time_at_the_top_of_its_signal_is_said_to_be_longer(desk):
+    for since, said in ((24.9, "valid 24.9 s ago"), (57.0, "valid over 25.0 s ago")):
+        desk.clock.now += 0.1
+        desk.send("Traversability", **WHOLE["Traversability"] | {"SinceValid": since})
+        assert said in desk.text("engineer", SIZES[0])
+
+
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize("size", SIZES + SMALLER)
 def test_no_line_is_longer_than_the_terminal_is_wide_and_no_page_higher(desk, name, size):

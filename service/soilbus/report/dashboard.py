@@ -332,7 +332,8 @@ class Dashboard:
         age, since = (self.known.number("Traversability", name) for name in ("Age", "SinceValid"))
         if age is None:
             return "no data"
-        return f"data {age:.1f} s old" + ("" if since is None else f", valid {since:.1f} s ago")
+        more = "over " if self.known.is_at_top("Traversability", "SinceValid") else ""
+        return f"data {age:.1f} s old" + ("" if since is None else f", valid {more}{since:.1f} s ago")
 
     def sentences(self) -> list[str]:
         """State, what to do, slip, draft, age, and why the bus is away; each where it is known."""

@@ -105,6 +105,12 @@ class ReceivedFrames:
         value = self.value(message, signal)
         return value if isinstance(value, float) else None
 
+    def is_at_top(self, message: str, signal: str) -> bool:
+        """Whether a number is the greatest that its signal can say, which of one that saturates means this or more."""
+        value = self.number(message, signal)
+        top = None if value is None else self._signals[message][signal].maximum
+        return value is not None and top is not None and value >= top
+
     def is_valid(self, message: str) -> bool:
         """Whether a message may be acted on: it is fresh and its Status, where it has one, is valid."""
         status = self.value(message, "Status")
