@@ -84,13 +84,14 @@ def headline(results: Sequence[WindowResult], config: Config) -> str:
 
 def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
     """Soil and draft in numbers, in words of the field."""
-    used = of_use(results)
+    good = [r for r in results if r.status is Status.VALID]
+    used, doubtful = (good, "") if good else (of_use(results), ", but no window is valid: doubtful")
     pressures = [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in used if r.bearing is not None]
     if pressures:
         value, std = np.array(pressures).T
         yield (
             f"The ground carried {_range(value, 'kPa')} (bearing pressure, in each window known to about "
-            f"± {2.0 * float(np.median(std)):.2g} kPa)."
+            f"± {2.0 * float(np.median(std)):.2g} kPa{doubtful})."
         )
     drafts = [d.value / 1e3 for r in used if (d := r.traversability.max_draft) is not None]
     pulled = [r.excitation.draft / 1e3 for r in results if r.excitation.draft is not None]
@@ -137,13 +138,12 @@ def _by_log(results: Sequence[WindowResult]) -> Table | None:
         return None
     rows = []
     for log, of in logs.items():
-        used = of_use(of)
+        used = [r for r in of if r.status is Status.VALID]
         bearing = [r.bearing.value / 1e3 for r in used if r.bearing]
         draft = [d.value / 1e3 for r in used if (d := r.traversability.max_draft)]
         go = sum(r.traversability.state is State.GO for r in of)
-        valid = sum(r.status is Status.VALID for r in of)
         rows.append((
-            log, f"{dates(of)} {clock_text(of[0].t)}".strip(), str(len(of)), str(valid), str(go),
+            log, f"{dates(of)} {clock_text(of[0].t)}".strip(), str(len(of)), str(len(used)), str(go),
             f"{np.median(bearing):.3g}" if bearing else "-", f"{np.median(draft):.2g}" if draft else "-",
         ))  # fmt: skip
     head = ("log", "first window ends", "windows", "valid", "GO", "bearing pressure, kPa", "largest draft, kN")
