@@ -895,7 +895,10 @@ def _blocks(values: Array, n: int) -> Array:
 
 
 def _yaw(facts: Facts) -> Iterator[Finding]:
-    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster."""
+    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster.
+
+    Where the track is known only speeds that differ by about yaw rate times track are of a turn, and not of a spin.
+    """
     window, rig = facts.window, facts.rig
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
         return
@@ -903,6 +906,9 @@ def _yaw(facts: Facts) -> Iterator[Finding]:
     apart = np.stack([rims[:, right] - rims[:, left] for left, right in pairs(rig).T.tolist()])
     with np.errstate(invalid="ignore"):
         turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(np.sign(apart).sum(axis=0)) == len(apart))
+        if rig.track is not None:
+            due = np.abs(window.yaw_rate) * rig.track
+            turns &= (np.abs(np.abs(apart) - due) < due / 2.0).all(axis=0)
     if turns.sum() * facts.config.estimator.bin < 2.0:
         raise UndecidableError("no turns: the sign of the yaw rate, and which wheels are left, cannot be decided")
     if median(np.sign(apart[0] * window.yaw_rate)[turns]) < 0.0:
