@@ -348,13 +348,13 @@ class WindowEstimator:
         if fit is None and not tracked.mismatch:
             if tracked.standstill + tracked.turning > 0:
                 return Status.NOT_EXCITED, _gated(tracked)
-            return Status.INVALID, "input_stale " + " ".join(sorted(task.poor)) if task.poor else "no_convergence"
+            return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
         failure = self._failure(tracked)
         if fit is None or failure is not None:
             status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
             return status, self._mismatch if failure == "model_mismatch" else "no_convergence"
         if task.poor:
-            return Status.DEGRADED, "input_stale " + " ".join(sorted(task.poor))
+            return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
         if fit.off_scale:

@@ -363,8 +363,8 @@ class Intake:
         missing += ["ground_speed"] if self._config.signals.ground_speed is None else []
         missing += [] if self.rig.wheels else ["wheels"]
         covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
-        badly_covered = [c.name for c in self.needed if covered[c.name] < self._options.min_coverage]
-        poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
+        stale = self.stale(end)
+        poor = [c.name for c in self.needed if c.name in stale or covered[c.name] < self._options.min_coverage]
         task = WindowTask(
             index=self._index,
             start=start,
@@ -372,7 +372,7 @@ class Intake:
             window=window,
             slip=self._slip(window),
             missing=tuple(missing),
-            poor=poor,
+            poor=tuple(poor),
             torque_limit=self._limits.at(end),
             track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
