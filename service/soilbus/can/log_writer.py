@@ -21,13 +21,8 @@ _WRITERS: dict[str, Callable[[Any], Any]] = {
 """Those that write into a file that is open."""
 
 
-def check_is_a_format(path: Path) -> None:
-    """Raise ValueError with one line where the file's suffix names none: long work asks first."""
-    _format_of(path)
-
-
-def _format_of(path: Path) -> tuple[str, bool]:
-    """Suffix of the format, and whether it is packed; a BLF is packed already."""
+def format_of(path: Path) -> tuple[str, bool]:
+    """Suffix of the format, and whether it is packed, as a BLF is already; ValueError with one line for another."""
     *_, kind, last = ("", "", *(suffix.lower() for suffix in path.suffixes))
     is_packed = last == ".gz"
     kind = kind if is_packed else last
@@ -46,7 +41,7 @@ def write_log(messages: Iterable[can.Message], path: Path) -> None:
     OSError
         The file cannot be written.
     """
-    kind, is_packed = _format_of(path)
+    kind, is_packed = format_of(path)
     with placed(path) as descriptor, open(descriptor, "wb+", closefd=False) as raw:
         packed = gzip.GzipFile(fileobj=raw, mode="wb") if is_packed else raw
         file = packed if kind == ".blf" else io.TextIOWrapper(packed, encoding="utf-8")

@@ -81,12 +81,12 @@ def check_outputs(*written: Path | None, read: Iterable[Path] = ()) -> None:
 
 def check_log_to_write(path: Path | None) -> None:
     """The same of a log: a format that can be written, in a folder that is there."""
-    from soilbus.can.log_writer import check_is_a_format
+    from soilbus.can.log_writer import format_of
 
     if path is None:
         return
     try:
-        check_is_a_format(path)
+        format_of(path)
     except ValueError as error:
         raise WorkError(str(error)) from None
     check_outputs(path)

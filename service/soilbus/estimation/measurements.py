@@ -390,17 +390,23 @@ def wheel_rotation(t: Array, speed: Array) -> Array:
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:
-    """Acceleration and its variance (N,) [m/s^2] as slopes of the ground speed's smooth curve.
+    """Acceleration as the slope of the ground speed's smooth curve (`local_cubics`), and its variance.
+
+    var a = max(mean var V, mean (V - curve)^2) * sum of squared weights of the slope,  means over the cubic's samples
 
     Parameters
     ----------
     t, speed, variance : Array
         Times [s], ground speeds [m/s] and variances of these, (N,).
 
+    Returns
+    -------
+    acceleration, variance : Array
+        [m/s^2] and its square, (N,); 0 and 1 of fewer than three speeds.
+
     Notes
     -----
-    What speeds near an instant miss the curve by counts as their noise where it is more: harsh driving is no precise
-    datum.
+    The misfit counts as noise where it is more, so that harsh driving does not pass for precise data.
     """
     if len(t) < 3:
         return np.zeros(len(t)), np.full(len(t), 1.0)

@@ -172,6 +172,10 @@ class PosteriorOptions:
     recorded."""
     gaussian_widening: float = 1.2
     """How much wider [1] it may be; no evidence recorded."""
+    max_log_variance: float = 4.0
+    """Variance of a parameter's logarithm [1] from which it is open, in what is reported: one that may be anywhere
+    within `bound_sd` prior sd (of 0.83, std = value) is uniform, with 4^2 0.83^2 / 3 = 3.7.  At its bound a parameter
+    that is linear in the fit may have any variance of its logarithm: without this k_phi had an std of 1e155 on snow."""
     drift_pieces: int = 5
     """Pieces of a window, each with its own soil; no evidence recorded."""
     steady_drift_sd: float = 7.0

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.estimation.options import ESTIMATOR
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
 
@@ -40,9 +41,6 @@ __all__ = [
 PARAMETERS = Soil._fields
 """Names of the soil parameters, in the order of every vector of them."""
 _PHI, _C = PARAMETERS.index("phi"), PARAMETERS.index("c")
-LARGEST_LOG_VARIANCE = 4.0
-"""Variance of a logarithm [1] from which a parameter is open: a factor of 7 at one sd, where priors have 2 to 3.  At
-its bound a parameter that is linear in the fit may have any variance of its logarithm, whose exponential overflows."""
 NORMAL_95 = 1.959964
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
@@ -122,7 +120,7 @@ class Posterior:
         """
         variance = np.diag(self.log_covariance).copy()
         variance[_PHI] = self._covariance(np.eye(len(PARAMETERS))[_PHI][None])[0, 0]
-        variance = np.minimum(variance, LARGEST_LOG_VARIANCE)
+        variance = np.minimum(variance, ESTIMATOR.posterior.max_log_variance)
         relative = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))
         return {n: Estimate(v, v * r) for n, v, r in zip(PARAMETERS, self.soil, relative.tolist(), strict=True)}
 
@@ -140,7 +138,7 @@ class Posterior:
         if v <= 0.0:
             return np.asarray(covariance)
         along = by_logs[:, [_PHI, _C]] @ self.log_covariance[[_PHI, _C], _C] / v
-        v = min(v, LARGEST_LOG_VARIANCE)
+        v = min(v, ESTIMATOR.posterior.max_log_variance)
         square = math.expm1(2.0 * v) - 2.0 * math.expm1(0.5 * v)
         return np.asarray(covariance + np.outer(along, along) * (square - v))
 

@@ -1,7 +1,7 @@
 """What to drive next: the manoeuvre that is expected to settle an ambiguous diagnosis, or to determine a soil best.
 
     rivals   argmax over manoeuvres of  sum over rivals A of P(A) P(A named | S(A, .))  (S: diagnosis/separation.py)
-    soil     argmin over manoeuvres of  sum of log sd of bearing pressure, phi and n    (D-optimum for these three)
+    soil     argmin over manoeuvres of  sum of log sd of bearing pressure, phi and n    (D-optimum for what is free)
 
 A manoeuvre is a table of steps of slip, ground speed, load from side to side, and slope.  Each candidate is simulated
 without noise, as every rival in turn predicts it or on the soil found, and bounded by the vehicle's limits: slips up
