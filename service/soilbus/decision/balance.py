@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -81,7 +81,7 @@ class Columns(NamedTuple):
         return Columns(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Balance:
     """The steady states of D soils at F slips, for A kinds of wheels.
 
@@ -100,27 +100,27 @@ class Balance:
     known: NDArray[np.bool_]
     columns: Array
 
-    @property
+    @cached_property
     def at(self) -> Columns:
         """Places of the columns."""
         return Columns.of(self.columns.shape[1] // 3)
 
-    @property
+    @cached_property
     def pull(self) -> Array:
         """Pull of the vehicle [N] (D, F)."""
         return self.columns[:, self.at.pull]
 
-    @property
+    @cached_property
     def drawbar(self) -> Array:
         """Drawbar pull of one wheel [N] (D, A, F)."""
         return self.columns[:, self.at.drawbar]
 
-    @property
+    @cached_property
     def torque(self) -> Array:
         """Torque of one wheel [N m] (D, A, F)."""
         return self.columns[:, self.at.torque]
 
-    @property
+    @cached_property
     def angle(self) -> Array:
         """Entry angle [rad] (D, A, F)."""
         return self.columns[:, self.at.angle]
@@ -337,8 +337,8 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
 
 def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
     """Sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), each times a factor (A, 1)."""
-    share = (axles.count * each)[:, 0].tolist()
-    return reduce(np.add, (share[kind] * values[:, kind] for kind in np.flatnonzero(kinds).tolist()))
+    share = np.where(kinds, (axles.count * each)[:, 0], 0.0)
+    return np.asarray(np.einsum("a,daf->df", share, values))
 
 
 def _columns(pull: Array, at: Iterable[Array]) -> Array:

@@ -50,8 +50,8 @@ def present_demand(
     recent = known & (window.t > window.t[-1] - hop)
     if not recent.any():
         return None
-    demands = (_over(window.rows(np.flatnonzero(part)), chassis, gain) for part in (recent, known))
-    return max(demands, key=lambda demand: demand.pull)
+    last, mean = (_over(window.rows(part), chassis, gain) for part in (np.flatnonzero(recent), np.flatnonzero(known)))
+    return last if last.pull >= mean.pull else mean
 
 
 def _over(window: Window, chassis: Chassis, gain: Estimate) -> Demand:

@@ -24,7 +24,7 @@ with it another capacity on the same ground; so the last moments' regression is 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from enum import StrEnum
 from functools import lru_cache
@@ -298,7 +298,7 @@ def watched(
     if not 0.0 <= step <= LONGEST_GAP:
         before, step = _restarted(before, t)._replace(since=t), 0.0
     look = Look(t, common_slip(slips, options.slip_exponent), pull, pull - inertia)
-    reserve = _reserve(curve, look.slip)
+    reserve = float(_reserve(curve, look.slip))
     kept = before.recent[bool(before.recent and t - before.recent[0].t > options.looks_kept) :]
     trend = before.capacity if curve is before.curve else _capacity_along(curve, kept, options)
     earlier, once, twice = _looks_from(
@@ -443,36 +443,28 @@ def _capacity_at(curve: OverSlip, look: Look, reserve: float | None = None) -> f
     """
     if look.slip < curve.slip[0]:
         return None
-    return look.pull + (_reserve(curve, look.slip) if reserve is None else reserve)
+    return look.pull + (float(_reserve(curve, look.slip)) if reserve is None else reserve)
 
 
 def _capacity_along(curve: OverSlip, recent: Sequence[Look], options: WatchOptions) -> Capacity:
     """The capacity at the last moments along a curve."""
     t, slip, pull, _ = np.array(recent, float).reshape(-1, len(Look._fields)).T
-    known = np.isfinite(curve.pull)
-    slips, pulls = curve.slip[known], curve.pull[known]
-    ahead = np.append(np.maximum.accumulate(pulls[::-1])[::-1], pulls[-1:])[np.searchsorted(slips, slip, "right")]
-    reserve = np.where(slip >= slips[-1], 0.0, ahead - np.interp(slip, slips, pulls))
-    reserve = np.where(slip >= curve.slip[0], reserve, np.nan)
+    reserve = np.where(slip >= curve.slip[0], _reserve(curve, slip), np.nan)
     return Capacity.through(t, pull + reserve, reserve, options)
 
 
-def _reserve(curve: OverSlip, slip: float) -> float:
-    """Pull [N] that the curve still gains beyond this slip; 0 at slips where most soils allow no steady driving."""
+def _reserve(curve: OverSlip, slip: Array | float) -> Array:
+    """Pull [N] that the curve still gains beyond slips; 0 at those where most soils allow no steady driving."""
     slips, pulls, ahead = _known_pulls(curve)
-    i = bisect_right(slips, slip)
-    if i == len(slips):
-        return 0.0
-    share = (slip - slips[i - 1]) / (slips[i] - slips[i - 1]) if i else 1.0
-    return ahead[i] - (pulls[i] - (1.0 - share) * (pulls[i] - pulls[i - 1]))
+    return np.asarray(ahead[np.searchsorted(slips, slip, "right")] - np.interp(slip, slips, pulls))
 
 
 @lru_cache(maxsize=2)
-def _known_pulls(curve: OverSlip) -> tuple[list[float], list[float], list[float]]:
-    """Slips and pulls [N] where the curve is known, and the greatest pull from each slip on."""
+def _known_pulls(curve: OverSlip) -> tuple[Array, Array, Array]:
+    """Slips and pulls [N] where the curve is known, and the greatest pull after each number of these slips."""
     known = np.isfinite(curve.pull)
     pull = curve.pull[known]
-    return curve.slip[known].tolist(), pull.tolist(), np.maximum.accumulate(pull[::-1])[::-1].tolist()
+    return curve.slip[known], pull, np.append(np.maximum.accumulate(pull[::-1])[::-1], pull[-1:])
 
 
 @lru_cache(maxsize=2)

@@ -152,8 +152,9 @@ def estimates(*samples: Array | None) -> list[Estimate | None]:
     known = [each for each in samples if each is not None]
     if not known:
         return [None] * len(samples)
-    found = zip(*(a.tolist() for a in mean_and_std(np.stack(known, axis=1))), strict=True)
-    return [None if each is None else _known(*next(found)) for each in samples]
+    found = iter(np.stack(mean_and_std(np.stack(known, axis=1)), axis=1).tolist())
+    pairs = [(math.nan, math.nan) if each is None else next(found) for each in samples]
+    return [Estimate(mean, std) if math.isfinite(mean) else None for mean, std in pairs]
 
 
 def likely(samples: Array | None) -> Estimate | None:

@@ -127,7 +127,7 @@ class UncertainModel:
         """The models of n rows of soils; the last rows belong to the perturbed models."""
         known = n - len(self.perturbed)
         row = np.concatenate([np.zeros(known, int), 1 + np.arange(len(self.perturbed))])
-        return ModelOfRows((self.mean, *(one.model for one in self.perturbed)), row)
+        return ModelOfRows((self.mean, *[one.model for one in self.perturbed]), row)
 
 
 def _perturbed_by_form(form: FormPosterior, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:

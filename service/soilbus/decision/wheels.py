@@ -275,7 +275,7 @@ def wheel_table(
 def _extrapolated(start: WheelTable, soils: Array) -> tuple[Array, Array]:
     """Pull (D, S) and entry angle (D, A, S) on other soils, by ridge regression on the soils' logarithms."""
     n_soils, n_slips = start.pull.shape
-    logs, other = (np.log(np.maximum(each, LEAST_POSITIVE)) for each in (start.soils, soils))
+    logs, other = np.log(np.maximum(start.soils, LEAST_POSITIVE)), np.log(np.maximum(soils, LEAST_POSITIVE))
     with np.errstate(all="ignore"):
         values = np.concatenate([start.pull, np.log(start.at[ANGLE]).reshape(n_soils, -1)], axis=1)
     apart, change = logs - logs[0], values - values[0]

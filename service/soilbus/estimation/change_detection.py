@@ -77,7 +77,7 @@ def change_statistic(
     n, m = at.by_latents.shape[:2]
     if first >= n:
         return ChangeStatistic(max(n - 1, 0), 0.0, math.inf)
-    rows, weighed = (a.reshape(n, m, -1)[first:] for a in (at.rows, at.weighed))
+    rows, weighed = at.rows.reshape(n, m, -1)[first:], at.weighed.reshape(n, m, -1)[first:]
     misfit = np.einsum("im,im->i", rows[:, :, RESIDUAL], weighed[:, :, RESIDUAL])
     count = np.count_nonzero(rows.any(axis=2), axis=1).astype(float)
     ratio = log_likelihood_ratio(misfit, count)
@@ -106,7 +106,7 @@ def _explained(gradient: Array, information: Array) -> Array:
 
 def log_likelihood_ratio(misfit: Array, count: Array) -> Array:
     """GLR (N,) from each instant on, by the sum of squares and the number of residuals of each instant (N,)."""
-    misfit, count = (np.cumsum(a[::-1])[::-1] for a in (misfit, count))
+    misfit, count = np.cumsum(np.stack([misfit, count])[:, ::-1], axis=1)[:, ::-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.maximum(misfit / count, 1.0)
         return np.where(count > 0.0, 0.5 * count * (excess - 1.0 - np.log(excess)), 0.0)

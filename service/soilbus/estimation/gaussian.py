@@ -52,16 +52,16 @@ def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
     -------
     (6,), (6, 6)
     """
-    pairs = list(zip(soil.tolist(), base.tolist(), strict=True))
-    new, old = zip(*(pair if pair[1] > 0.0 else (1.0, 1.0) for pair in pairs), strict=True)  # a held one may be zero
-    change, slopes = np.log(np.divide(new, old)), np.eye(len(soil))
+    values = np.where(base > 0.0, [soil, base], 1.0)  # a held one may be zero
+    change, slopes = np.log(values[0] / values[1]), np.eye(len(soil))
+    new, old = values.tolist()
     for i in (_K_C, _N, _C):
         change[i], slopes[i, i] = (new[i] - old[i]) / old[i], new[i] / old[i]
     tan, tan_at_base = math.tan(new[_PHI]), math.tan(old[_PHI])
     unit = old[_PHI] * (1.0 + tan_at_base**2)
     change[_PHI], slopes[_PHI, _PHI] = (tan - tan_at_base) / unit, new[_PHI] * (1.0 + tan**2) / unit
-    K_L, K_L_at_base = (s[_K_PHI] + s[_K_C] / width for s in (new, old))
-    k_phi, ratio = old[_K_PHI], K_L_at_base / K_L
+    K_L_at_base = old[_K_PHI] + old[_K_C] / width
+    k_phi, ratio = old[_K_PHI], K_L_at_base / (new[_K_PHI] + new[_K_C] / width)
     change[_K_PHI] = (-math.log(ratio) * K_L_at_base - (new[_K_C] - old[_K_C]) / width) / k_phi
     slopes[_K_PHI, _K_PHI] = ratio * new[_K_PHI] / k_phi
     slopes[_K_PHI, _K_C] = (ratio - 1.0) * new[_K_C] / width / k_phi

@@ -249,7 +249,7 @@ class Measurements:
         self.n = len(self.t)
         self._n_known = int(self._known.sum())
         self._missing = None if self._n_known == self._known.size else ~self._known
-        self._radius, self._width = (np.tile(a, self.n) for a in (self.rig.radius, self.rig.width))
+        self._radius, self._width = np.tile(self.rig.radius, self.n), np.tile(self.rig.width, self.n)
         self._length = 0.0 if self.rig.lengths is None else np.tile(self.rig.lengths, self.n)
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:

@@ -34,7 +34,7 @@ from soilbus.estimation.observation_model import (
 from soilbus.estimation.options import SearchOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
-from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Solution, Termination, minimise
+from soilbus.estimation.solver import CONVERGED, Iterate, Objective, QuadraticModel, Solution, Termination, minimise
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
@@ -150,7 +150,7 @@ class Fit:
     @property
     def converged(self) -> bool:
         """Whether the descent ended at an optimum."""
-        return self.termination.is_converged
+        return self.termination in CONVERGED
 
     @property
     def gains(self) -> Array:
@@ -463,7 +463,7 @@ def fit_at(objective: Objective, end: Solution, evaluations: int = 0) -> Fit | N
     inverse = solve_with_inverse(end.model.information, end.model.gradient)
     if inverse is None:
         return None
-    is_converged, previous = end.termination.is_converged, end.previous
+    is_converged, previous = end.termination in CONVERGED, end.previous
     last_decrease = end.predicted_decrease if is_converged else 0.0
     return Fit(
         mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1], previous.soil),

@@ -336,9 +336,9 @@ class ObservationModel(Measurements):
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
         residual[:, torques] = self.torque * of_torque - torque
         residual[:, balance] = inertia + draft + at.extra_pull - at.value[0].sum(1)
-        by_soil[:, torques] = self._by_torque_row(-at.by_soil[1])
+        by_soil[:, torques] = self.torque_rows(-at.by_soil[1]).transpose(1, 2, 0)
         by_soil[:, balance] = -at.by_soil[0].sum(2).T
-        by_effects[:, torques] = self._by_torque_row(-at.by_effects[1])
+        by_effects[:, torques] = self.torque_rows(-at.by_effects[1]).transpose(1, 2, 0)
         by_effects[:, balance] = (at.extra_pull_by_effects - at.by_effects[0].sum(2)).T
         if self.with_sinkage:
             residual[:, sinkages] = self.sinkage - at.value[2]
@@ -348,7 +348,7 @@ class ObservationModel(Measurements):
         latent_by_gain = now * of_latents
         if by_sensors:
             by_gain = rows[:, :, layout.sensor_columns]
-            diagonals(by_gain[:, torques, layout.torque_gains])[:] = -of_torque * torque
+            np.einsum("nww->nw", by_gain[:, torques, layout.torque_gains])[:] = -of_torque * torque
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, layout.latent_gains])
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
@@ -603,8 +603,8 @@ class ObservationModel(Measurements):
         kinds = ((1, layout.torques), (2, layout.sinkages)) if self.with_sinkage else ((1, layout.torques),)
         for kind, rows in kinds:
             wheel_rows = A[:, rows]
-            diagonals(wheel_rows[:, :, loads])[:] = by_load[kind]
-            diagonals(wheel_rows[:, :, speeds])[:] = by_speed[kind]
+            np.einsum("nww->nw", wheel_rows[:, :, loads])[:] = by_load[kind]
+            np.einsum("nww->nw", wheel_rows[:, :, speeds])[:] = by_speed[kind]
             wheel_rows[:, :, ground] = by_ground[kind]
         return A
 
@@ -614,10 +614,6 @@ class ObservationModel(Measurements):
             return A
         A[:, self.layout.torques] = self._torque_matrix @ A[:, self.layout.torques]
         return np.asarray(A @ self._from_observed)
-
-    def _by_torque_row(self, of_wheels: Array) -> Array:
-        """Derivatives of the torque rows (N, W, P) from those of the wheels' torques (P, N, W)."""
-        return self.torque_rows(of_wheels).transpose(1, 2, 0)
 
     def _corrected(self, gains: Array) -> tuple[Array, Array, float, float, Array, Array, Array]:
         """Factors 1 / (1 + gain) of torques, latents, draft, mass; corrected latents; their variances; those of rows.
@@ -751,7 +747,7 @@ class ObservationModel(Measurements):
         """
         variance, row_var = self.variances(gains)
         inverse = self.inverse_covariance(at.by_latents, variance, row_var)
-        root = np.sqrt(diagonals(inverse))
+        root = np.sqrt(np.einsum("nmm->nm", inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
         weighed[~self._known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
@@ -768,7 +764,7 @@ class ObservationModel(Measurements):
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
         rows = np.zeros((n, m, len(pull)))
-        rows[:, layout.torques] = self._by_torque_row(-torque)
+        rows[:, layout.torques] = self.torque_rows(-torque).transpose(1, 2, 0)
         rows[:, layout.balance] = -pull.sum(2).T
         if self.with_sinkage:
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
@@ -1081,7 +1077,7 @@ class ObservationModelWithEffects(ObservationModel):
         places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
         standardised, P = gains[self.layout.effects], len(self.free)
         found: dict[str, tuple[Array, Array]] = {}
-        predicted, by_predicted = self._no_delay("torque", P)
+        predicted, by_predicted = np.zeros_like(torque), np.zeros((P, *torque.shape))
         for effect in self.effects:
             for quantity, (delay, time_constant) in effect.late.items():
                 at = places[effect.name, delay], places[effect.name, time_constant]
@@ -1304,24 +1300,18 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array
     latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a point of finite cost.
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
-    diagonals(S)[:] += row_var
+    diagonal = np.einsum("nmm->nm", S)  # a view
+    diagonal += row_var
     if further is not None:
         S += further
-    scale = 1.0 / np.sqrt(diagonals(S))
+    scale = 1.0 / np.sqrt(diagonal)
     S *= scale[:, :, None] * scale[:, None, :]
     try:
         inverse = np.linalg.inv(S)
     except np.linalg.LinAlgError:
-        diagonals(S)[:] += SINGULAR_RIDGE
+        diagonal += SINGULAR_RIDGE
         inverse = np.linalg.inv(S)
     return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
-
-
-def diagonals(blocks: Array) -> Array:
-    """Writeable view (N, W) of the diagonals of blocks (N, W, W)."""
-    view = blocks.diagonal(axis1=1, axis2=2)
-    view.flags.writeable = True  # numpy gives a view, for reading only
-    return view
 
 
 def _interpolated(instants: NDArray[np.intp], values: Array, n: int) -> Array:

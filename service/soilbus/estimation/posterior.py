@@ -126,7 +126,8 @@ class Posterior:
 
     def propagate(self, gradient: Array) -> float:
         """Sd of a scalar with this gradient (6,) by the parameters in SI: first order, but for the spread of c."""
-        return _root(float(self._covariance((gradient * np.asarray(self.soil))[None])[0, 0]))
+        variance = float(self._covariance((gradient * np.asarray(self.soil))[None])[0, 0])
+        return math.sqrt(max(variance, 0.0))  # rounding may take it below zero
 
     def _covariance(self, by_logs: Array) -> Array:
         """Covariance (S, S) of scalars with these derivatives (S, 6) by the logarithms.
@@ -214,7 +215,7 @@ class Posterior:
         """Mahalanobis distance of a soil, in sd, by all free parameters together."""
         free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
         off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
-        return _root(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)))
+        return math.sqrt(max(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)), 0.0))
 
     def _estimate(self, scalar: Scalar) -> Estimate:
         return Estimate(scalar.value, self.propagate(scalar.gradient))
@@ -245,8 +246,3 @@ def tyre_modulus(soil: Soil, width: float) -> Scalar:
     """Lumped modulus K_L [N/m^(n+2)] under a tyre of this width [m] (eq. 35 of Xi et al. 2024)."""
     value = float(lumped_modulus(soil.k_c, soil.k_phi, width))
     return Scalar(value, np.array([1.0 / width, 1.0, 0.0, 0.0, 0.0, 0.0]))
-
-
-def _root(variance: float) -> float:
-    """Square root of a variance that rounding may have taken below zero."""
-    return float(np.sqrt(max(variance, 0.0)))

@@ -186,7 +186,7 @@ class Objective:
         is_active = np.diag(joint_prior.covariance)[_SOIL:] > 0.0
         is_active[: problem.n_sensors if as_measured else 0] = False
         self.active = np.flatnonzero(is_active)
-        self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds)
+        self._gain_bounds = problem.gain_bounds[0][self.active], problem.gain_bounds[1][self.active]
         self._has_gain_bounds = bool(np.isfinite(self._gain_bounds).any())
         self.free = self.coordinates.free
         self._identity = np.eye(len(self.free) + len(self.active))
@@ -391,10 +391,9 @@ class Termination(StrEnum):
     NOT_FINITE = "not_finite"
     """The model is not finite, or has no minimum, where the descent begins."""
 
-    @property
-    def is_converged(self) -> bool:
-        """Whether the descent ended at an optimum."""
-        return self in (Termination.STEP, Termination.DECREASE)
+
+CONVERGED = frozenset({Termination.STEP, Termination.DECREASE})
+"""Terminations of a descent that ended at an optimum."""
 
 
 class Solution(NamedTuple):
@@ -431,10 +430,7 @@ class _Expansion(NamedTuple):
     model: QuadraticModel
     step: Array
     decrease: float
-
-    @property
-    def value(self) -> float:
-        return self.model.neg2_log_posterior
+    value: float  # of the objective
 
 
 def minimise(
@@ -490,7 +486,7 @@ def minimise(
         damping, fraction = damping / options.damping_factor, min(2.0 * fraction, 1.0)
         if here.value < lowest.value:
             lowest = here
-    if not ended.is_converged:
+    if ended not in CONVERGED:
         here = lowest
     end = objective.stepped(here.iterate, here.model, here.step)
     return Solution(end, here.iterate, here.model, here.decrease, evaluations, ended)
@@ -516,7 +512,9 @@ def _expanded(objective: Objective, iterate: Iterate, damping: float) -> _Expans
 
 def _with_step(iterate: Iterate, model: QuadraticModel, damping: float) -> _Expansion | None:
     step = model.step(damping)
-    return None if step is None else _Expansion(iterate, model, step, model.squared_length(step))
+    return (
+        None if step is None else _Expansion(iterate, model, step, model.squared_length(step), model.neg2_log_posterior)
+    )
 
 
 def _termination(

@@ -298,7 +298,7 @@ def _slides(window: Window, rig: Rig, max_lateral: float, difference: Array) -> 
 
 def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:
     """Right less left rim speed (N, P) of each pair: over their mean, and in m/s; nan where unknown."""
-    left, right = (rig.radius[side] * window.speed[:, side] for side in pairs(rig))
+    left, right = (rig.radius * window.speed).T[pairs(rig)].swapaxes(1, 2)
     with np.errstate(invalid="ignore", divide="ignore"):
         return 2.0 * (right - left) / (left + right), right - left
 

@@ -52,10 +52,10 @@ class Stress(NamedTuple):
 def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     """Of the soil alone, without its pan."""
     theta, slip, r, _, K_L, n, _, _, K, _ = state
-    q = model.quadrature
-    if model.exit_varies:
+    q, exit_varies = model.quadrature, model.exit_angle or model.exit_slip
+    if exit_varies:
         q = q._replace(exit=model.leave(theta, slip))
-    if skid or model.peak_c2 or model.exit_varies:
+    if skid or model.peak_c2 or exit_varies:
         peak = model.peak(slip)
         x, w = gauss(q.nodes, q.power)
         if skid:
@@ -127,10 +127,6 @@ def unit_of(state: WheelState) -> Array:
     return unit
 
 
-def dot(field: Array, rows: Array) -> Array:
-    return np.asarray(np.einsum("bmn,bmn->n", field, rows))
-
-
 def integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
     """What fields (F, 2, M, N), the first few of normal stress and the rest of shear, add to W, DP and T (3, F, N)."""
     along, across = np.einsum("fbmn,bmn->fn", fields, rim.cos), np.einsum("fbmn,bmn->fn", fields, rim.sin)
@@ -153,10 +149,9 @@ def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobili
     glide = state.radius / state.K * ((1.0 - state.slip) * rim.cos - 1.0)
     shear = state.tan_phi * at.shear_share * normal + mobilising * glide * turn + state.c * at.stuck * spread
     normal = normal + turn * tau
-    around = shear.sum((0, 1))
-    shear = shear - turn * at.normal
-    load = dot(normal, rim.cos) + dot(shear, rim.sin)
-    return np.stack([load, dot(shear, rim.cos) - dot(normal, rim.sin), around])
+    whole = integrals(np.stack([normal, shear - turn * at.normal]), 1, rim).sum(axis=1)
+    whole[2] = shear.sum((0, 1))  # a turn of the normal stress has no torque
+    return np.asarray(whole)
 
 
 def by_leave(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,11 +28,11 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     >>> round(1e3 * float(sinkage(angle, 0.5)))  # mm
     45
     """
-    given = state if state.has_tracks else state[:-1]
-    load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *given))
-    shape = load.shape
-    load, *fields = (a.ravel() for a in (load, *fields))
-    guess, rest = fields[0], fields[1:]
+    given = state if np.any(state.length) else state[:-1]
+    rows = np.array(np.broadcast_arrays(load, *given), float)
+    shape = rows.shape[1:]
+    load, guess, *_ = rows = rows.reshape(len(rows), -1)
+    rest = rows[2:]
     low = np.full(load.shape, np.log(MIN_ENTRY_ANGLE))
     top = np.log(MAX_ENTRY_ANGLE)
     high = np.full(load.shape, top)
@@ -46,7 +45,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     for _ in range(80):
         if not len(todo):
             break
-        part = WheelState(np.exp(at[todo]), *(f[todo] for f in rest))
+        part = WheelState(np.exp(at[todo]), *rest[:, todo])
         W, slope = carried_and_slope(part, model)
         miss = np.where(W > 0.0, np.log(np.maximum(W, 1e-300)), -690.0) - target[todo]
         above = miss > 0.0
@@ -65,7 +64,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     return angle.reshape(shape)
 
 
-def _first_guess(load: Array, rest: Sequence[Array]) -> Array:
+def _first_guess(load: Array, rest: Array) -> Array:
     """log entry angle from the small-angle load K_L b r^(n+1) theta^(2n+1) / (n + 1.5); of a track from
 
     K_L b L (r theta^2 / 2)^n.
@@ -77,4 +76,4 @@ def _first_guess(load: Array, rest: Sequence[Array]) -> Array:
         return np.asarray(of_wheel)
     length = rest[-1]
     of_track = (np.log(load / (width * length * K_L)) / n + np.log(2.0 / radius)) / 2.0
-    return np.where(length > 0.0, of_track, of_wheel)
+    return np.asarray(np.where(length > 0.0, of_track, of_wheel))

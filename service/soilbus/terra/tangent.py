@@ -58,7 +58,7 @@ def _derivatives(
     """Forces (3, ...) and their derivatives (3, ...) by INPUTS, these of SHAPE and, where asked for, the radius."""
     integrated = model
     asked = shape | {"pan_depth"} if of_radius and (model.pan_stiffness or "pan_stiffness" in shape) else shape
-    if of_radius and state.has_tracks:
+    if of_radius and np.any(state.length):
         asked = asked | {"length"}
     if "pan_stiffness" in shape and not model.pan_stiffness:
         integrated = replace(model, pan_stiffness=_FAINT)

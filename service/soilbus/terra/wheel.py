@@ -8,7 +8,7 @@ quadrature at the nodes of terra.rim.  Where a state has a contact length it is 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,7 +21,6 @@ from soilbus.terra.contact_stress import (
     by_exponential_share,
     by_leave,
     by_peak,
-    dot,
     entering,
     integrals,
     leaving,
@@ -165,14 +164,13 @@ def in_chunks(integrate: OnRim, of_track: OnTrack, n_rows: int, state: WheelStat
     """(n_rows, ...) of an integrator of stresses and of the closed form of tracks; both get rows (N,) or floats."""
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
-    fields = [np.asarray(a, float) for a in state]
     rows = WheelState(*[
         (a if a.shape == shape else np.broadcast_to(a, shape)).reshape(n_samples)
         if a.ndim or i < 2 else float(a)  # entry angle and slip always by sample
-        for i, a in enumerate(fields)
+        for i, a in enumerate(map(partial(np.asarray, dtype=float), state))
     ])  # fmt: skip
     out = np.empty((n_rows, n_samples))
-    if rows.has_tracks:
+    if np.any(rows.length):
         tracked = np.broadcast_to(np.asarray(rows.length) > 0.0, n_samples)
         tracks, wheels = np.flatnonzero(tracked), np.flatnonzero(~tracked)
         out[:, tracks] = of_track(_samples(rows, tracks), model)
@@ -180,32 +178,28 @@ def in_chunks(integrate: OnRim, of_track: OnTrack, n_rows: int, state: WheelStat
             samples = _samples(rows, wheels)._replace(length=0.0)
             out[:, wheels] = in_chunks(integrate, of_track, n_rows, samples, model)
         return out.reshape(n_rows, *shape)
-    skid = rows.slip < 0.0
-    for run, skidding in _runs(skid, model.nodes):
-        samples = _samples(rows, run)
+    for run, samples, skidding in _runs(rows, model.nodes):
         out[:, run] = integrate(stresses(samples, model, skidding), samples, model)
     if model.pan_stiffness:
-        frictional = rows._replace(c=0.0)
-        for run, skidding in _runs(skid, model.nodes, reaching(rows, model)):
-            samples = _samples(frictional, run)
+        for run, samples, skidding in _runs(rows._replace(c=0.0), model.nodes, reaching(rows, model)):
             out[:, run] += integrate(pan_stresses(samples, model, skidding), samples, model)
     return out.reshape(n_rows, *shape)
 
 
 def _runs(
-    skid: NDArray[np.bool_], nodes: int, chosen: NDArray[np.bool_] | None = None
-) -> Iterator[tuple[slice | NDArray[np.intp], bool]]:
+    rows: WheelState, nodes: int, chosen: NDArray[np.bool_] | None = None
+) -> Iterable[tuple[slice | NDArray[np.intp], WheelState, bool]]:
     """Samples, chosen ones or all (N,), in chunks, and whether they skid: those that do need split panels."""
-    chunk = max(_CHUNK // nodes, 1)
-    if chosen is None and not skid.any():
-        yield from ((slice(i, i + chunk), False) for i in range(0, len(skid), chunk))
-        return
-    for skidding in (False, True):
-        members = np.flatnonzero(skid == skidding if chosen is None else chosen & (skid == skidding))
-        yield from ((members[i : i + chunk], skidding) for i in range(0, len(members), chunk))
+    skid, chunk = rows.slip < 0.0, max(_CHUNK // nodes, 1)
+    if chosen is None and len(skid) <= chunk and not skid.any():
+        return [(slice(None), rows, False)]
+    driving, skidding = (~skid, skid) if chosen is None else (chosen & ~skid, chosen & skid)
+    members = (np.flatnonzero(driving), False), (np.flatnonzero(skidding), True)
+    runs = [(of[i : i + chunk], skids) for of, skids in members for i in range(0, len(of), chunk)]
+    return [(run, _samples(rows, run), skids) for run, skids in runs]
 
 
-def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
+def _samples(rows: WheelState, chosen: NDArray[np.intp]) -> WheelState:
     """Some samples of fields that are (N,) or floats."""
     return WheelState(*[a if isinstance(a, float) else a[chosen] for a in rows])
 
@@ -215,8 +209,8 @@ def _load_and_slope(at: Stress, state: WheelState, model: WheelModel) -> Array:
     tau, mobilising = sheared(at, state)
     normal, shear = entering(at, state, tau, mobilising)
     sin, cos = at.rim.sin, at.rim.cos
-    load = dot(at.normal, cos) + dot(tau, sin)
-    slope = dot(normal, cos) + dot(shear, sin) + load / state.entry_angle
+    load, slope = np.einsum("qfbmn,fbmn->qn", [[at.normal, tau], [normal, shear]], [cos, sin])
+    slope += load / state.entry_angle
     if model.exit_angle:
         rate, _ = leaving(state.entry_angle, state.slip, model)
         slope = slope + rate * by_leave(at, state, model, tau, mobilising)[0]
@@ -249,7 +243,7 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
     by_normal, deeper, pressed, by_rubbed, by_stuck, turned, rubbed_deeper, by_slip, by_K = integrals(
         fields, 3, at.rim
     ).swapaxes(0, 1)
-    turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
+    turned[2] += np.einsum("bmn,bmn->n", at.normal, at.share)
     by_entry, of_slip = _reshaped(at, state, model, tau, mobilising)
     turned += by_entry
     by_slip += of_slip
@@ -278,7 +272,7 @@ def _reshaped(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobi
     by_slip: Any = 0.0
     if model.peak_c2:
         by_slip = peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
-    if model.exit_varies:
+    if model.exit_angle or model.exit_slip:
         later = by_leave(at, state, model, tau, mobilising)
         of_entry, of_slip = leaving(state.entry_angle, state.slip, model)
         by_entry, by_slip = of_entry * later, by_slip + of_slip * later
@@ -312,7 +306,7 @@ def _forces_and_slopes(at: Stress, state: WheelState, model: WheelModel) -> Arra
     fields[1], fields[3] = entering(at, state, tau, mobilising)
     np.multiply(mobilising, at.rim.travel, out=fields[4])
     pressing, pressed, rubbing, turned, by_slip = integrals(fields, 2, at.rim).swapaxes(0, 1)
-    turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
+    turned[2] += np.einsum("bmn,bmn->n", at.normal, at.share)
     by_entry, of_slip = _reshaped(at, state, model, tau, mobilising)
     turned += by_entry
     by_slip += of_slip

@@ -63,11 +63,6 @@ class WheelModel:
         share = self.peak_c1 + self.peak_c2 * slip * (1.0 + self.peak_bend) / (1.0 + self.peak_bend * np.abs(slip))
         return np.minimum(np.maximum(share, PEAK[0]), PEAK[1])
 
-    @property
-    def exit_varies(self) -> bool:
-        """Whether the exit angle is another share of each entry angle."""
-        return bool(self.exit_angle or self.exit_slip)
-
     def leave(self, entry_angle: Array, slip: Any) -> Any:
         """Exit angle over entry angle (N,)."""
         ratio = self.exit_ratio + self.exit_slip * np.maximum(slip, 0.0)
@@ -92,8 +87,3 @@ class WheelState(NamedTuple):
     c: Any
     K: Any
     length: Any = 0.0
-
-    @property
-    def has_tracks(self) -> bool:
-        """Whether any is a track."""
-        return self.length > 0.0 if isinstance(self.length, float) else bool(np.any(self.length))

@@ -182,7 +182,7 @@ def _half_flat(radius: Any, deflection: Any) -> Any:
 
 def _deflection(state: WheelState, around: Surroundings, values: Values) -> Any:
     deflection = np.minimum(values["compliance"] * np.maximum(around.load, 0.0), _MOST_DEFLECTION * state.width)
-    return deflection * np.equal(state.length, 0.0) if state.has_tracks else deflection  # a track has no tyre
+    return deflection * np.equal(state.length, 0.0)  # a track has no tyre
 
 
 def _rolling(radius: Any, deflection: Any) -> Any:

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, diagonals
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -131,7 +131,7 @@ def _whitened(problem: ObservationModel, at: Linearisation, latents: Latents) ->
     """
     own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
     covariance = at.by_latents * at.variance[:, None] @ at.by_latents.swapaxes(1, 2)
-    diagonals(covariance)[:] += own
+    np.einsum("nww->nw", covariance)[:] += own
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
     linear = (at.by_latents @ (at.corrected - now)[:, :, None])[:, :, 0]

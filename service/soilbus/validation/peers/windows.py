@@ -10,7 +10,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import model_of, rig_of
-from soilbus.estimation.observation_model import Linearisation, ObservationModel, diagonals
+from soilbus.estimation.observation_model import Linearisation, ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig
 from soilbus.simulator.recording import simulate
@@ -114,7 +114,7 @@ def reading_covariance(problem: ObservationModel, at: Linearisation) -> Array:
     latent = np.concatenate([problem.load_var, problem.speed_var, problem.ground_speed_var[:, None]], axis=1)
     covariance = np.einsum("nik,nk,njk->nij", at.by_latents, latent, at.by_latents)
     own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
-    diagonals(covariance)[:] += own
+    np.einsum("nww->nw", covariance)[:] += own
     return np.asarray(covariance)
 
 
