@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
+from soilbus.can.mapping import channels_of, load_databases
 from soilbus.cli.main import main
 from soilbus.config.file import load_config, machine, overridden, parse_config
 from soilbus.config.model import Config, ConfigError
@@ -224,7 +225,7 @@ def test_noise_that_is_not_given_is_told(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("vehicle.towing=unknown", "signals.draft is mapped and counts"),
+        ("vehicle.towing=unknown", "signals.draft is not used, so there is no GO"),
         ("vehicle.steering=skid", "with neither vehicle.track nor signals.yaw_rate"),
         ("wheel.FL.gear_ratio=24", "wheel.FL.gear_ratio = 24 concerns no signal of it"),
     ],
@@ -244,6 +245,14 @@ def test_a_draft_that_nothing_measures_is_said_to_leave_no_go(capsys, tmp_path):
     assert "signals.draft is not mapped" in line
     assert "no GO" in line
     assert warnings(tmp_path / "c.toml", capsys, "vehicle.towing=never") == []
+
+
+def test_a_draft_said_to_be_unknown_is_not_read_from_a_sensor_that_shows_a_part_of_it():
+    def channels(*overrides: str) -> set[str]:
+        config = load_config(machine("tractor-2wd"), overrides)
+        return {channel.quantity for channel in channels_of(config, load_databases(config))}
+
+    assert channels() - channels("vehicle.towing=unknown") == {"draft"}
 
 
 @pytest.mark.parametrize("kind", ["kinematic", "specific_force"])

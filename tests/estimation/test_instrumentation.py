@@ -284,6 +284,27 @@ def test_wheels_on_a_differential_of_one_measured_speed_are_all_missing_with_it(
     assert np.isfinite(one.speed[5, [rig.wheels.index("FL"), rig.wheels.index("FR")]]).all()
 
 
+def test_a_wheel_with_a_sensor_of_its_own_keeps_it_beside_that_of_its_axle(tmp_path):
+    """Speed and load of RL are measured, those of RR follow from the motor's speed and the axle's load."""
+    text = without(without(without(PLAIN, "load", "FL FR RR"), "torque"), "speed", "FL FR RR")
+    for wheel in ("FL", "FR"):
+        text = text.replace(f'name = "{wheel}"', f'name = "{wheel}"\ndriven = false')
+    keys = 'torque = "McuRL.ShaftTorque"\nmotor_speed = "McuRL.ShaftSpeed"\nload = "AxleLoads.RR"'
+    config = configured(tmp_path, with_axle(text, "rear", keys))
+    rig = rig_of(config)
+    truth = modelled_drive(config, rig, np.arange(0.05, 3.0, 0.1))
+    left, right = rig.wheels.index("RL"), rig.wheels.index("RR")
+    for quantity in ("speed", "load"):
+        truth[quantity][right] *= 1.2
+        raw = np.full((len(truth["ground_speed"]), 4), np.nan)
+        for column, name in enumerate(rig.names[quantity]):
+            if name:
+                raw[:, column] = channel_value(rig, quantity, name, truth[quantity])
+        one = completed(replace(window_of(config, rig, 3.0), **{quantity: raw}), rig)
+        for wheel in (left, right):
+            assert getattr(one, quantity)[:, wheel] == pytest.approx(truth[quantity][wheel])
+
+
 def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     config = configured(tmp_path, rear_driven())
     rig = rig_of(config)

@@ -135,7 +135,7 @@ def _roles(config: Config) -> Iterator[_Role]:
             if (mapped := getattr(axle, role)) is not None:
                 yield _Role(quantity, axle, mapped, f"axle.{axle.name}.{role}")
     for quantity in VEHICLE_ROLES:
-        if (mapped := getattr(config.signals, quantity)) is not None:
+        if (mapped := getattr(config.signals, quantity)) is not None and (quantity != "draft" or config.measures_draft):
             yield _Role(quantity, None, mapped, f"signals.{quantity}")
     if config.vehicle is not None and config.vehicle.differential_lock is not None:
         yield _Role(LOCK, None, config.vehicle.differential_lock, f"vehicle.{LOCK}")

@@ -236,7 +236,8 @@ class Vehicle(_Section):
     track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
     """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
     towing: Literal["measured", "never", "unknown"] = "measured"
-    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows."""
+    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows in full: then
+    `signals.draft` is not used, and there is no GO."""
     steering: Literal["wheels", "skid"] = "wheels"
     """By turned wheels, or by the speeds of the two sides, which lets the wheels slide sideways in every turn."""
     differential_lock: Signal | None = None
@@ -971,6 +972,11 @@ class Config(_Section):
     def tows_nothing(self) -> bool:
         """Whether nothing is ever towed."""
         return self.vehicle is not None and self.vehicle.towing == "never"
+
+    @property
+    def measures_draft(self) -> bool:
+        """Whether a sensor shows all that is towed."""
+        return self.signals.draft is not None and (self.vehicle is None or self.vehicle.towing != "unknown")
 
     @property
     def on_tracks(self) -> bool:

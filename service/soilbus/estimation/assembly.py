@@ -370,8 +370,7 @@ def _read(config: Config, effect: Effect) -> bool:
     if config.table is not None:
         return True
     has_cells = any(w.load is not None for w in config.wheel) or any(a.load is not None for a in config.axle)
-    has_draft = config.signals.draft is not None
-    return (effect.load is None or has_cells) and (effect.draft is None or has_draft)
+    return (effect.load is None or has_cells) and (effect.draft is None or config.measures_draft)
 
 
 def _has_tyres(config: Config) -> bool:

@@ -38,7 +38,7 @@ LEAST_WEIGHT = 1e-12
 
 
 class Group(NamedTuple):
-    """A channel of one wheel or more: sum(weight x) over these wheels; the raw window has it in the first one's column.
+    """A channel of one wheel or more: sum(weight x) over these wheels.
 
     name: of the wheel or the axle that it is mapped for.
     """
@@ -173,16 +173,19 @@ def rows_of(
 ) -> tuple[tuple[Row, ...], tuple[str, ...]]:
     """W independent rows: the channels first, then what else is known; and names (W,) of the raw window's columns.
 
-    A row that the rows before it imply adds nothing and is left out: a motor's speed beside those of its wheels.
+    A row that the rows before it imply adds nothing and is left out: a motor's speed beside those of its wheels.  The
+    raw window has a channel in the column of the first of its wheels that no channel of fewer wheels has.
     """
     rows: list[Row] = []
-    names = [""] * n_wheels
     for group in channels:
         weight = np.zeros(n_wheels)
         weight[list(group.wheels)] = group.weight
         if _independent(rows, weight):
-            rows.append(Row(tuple(weight.tolist()), "channel", group.wheels[0], group.name, gain))
-            names[group.wheels[0]] = group.name
+            rows.append(Row(tuple(weight.tolist()), "channel", -1, group.name, gain))
+    names = [""] * n_wheels
+    for i in sorted(range(len(rows)), key=lambda i: np.count_nonzero(rows[i].weight)):
+        column = next(w for w, of in enumerate(rows[i].weight) if of and not names[w])
+        rows[i], names[column] = rows[i]._replace(at=column), rows[i].name
     for row in otherwise:
         if len(rows) < n_wheels and _independent(rows, np.array(row.weight)):
             rows.append(row)
@@ -223,7 +226,7 @@ def completed(window: Window, rig: Rig) -> Window:
     Parameters
     ----------
     window : Window
-        From `forward`: channels as measured, each in the column of its first wheel.
+        From `forward`: channels as measured, each in its own column (`rows_of`).
     rig : Rig
         With its instrumentation.
 

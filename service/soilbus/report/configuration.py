@@ -113,7 +113,10 @@ def _lines_of_vehicle(config: Config) -> Iterator[str]:
             " only what could be pulled"
         )
     if config.vehicle.towing == "unknown" and config.signals.draft is not None:
-        yield 'vehicle.towing = "unknown", but signals.draft is mapped and counts: "measured" is meant'
+        yield (
+            'vehicle.towing = "unknown": signals.draft is not used, so there is no GO; if it shows all that is towed,'
+            ' "measured" is meant'
+        )
     if shows_no_slope(config):
         yield NO_SLOPE
     if config.vehicle.steering == "skid" and not (config.vehicle.track or config.signals.yaw_rate):
@@ -346,7 +349,7 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
     elif not rig.wheels or config.signals.ground_speed is None:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
-        draft = config.signals.draft is not None
+        draft = config.measures_draft
         widths = len({float(b) for b in rig.width}) > 1
         sinkage = any(w.sinkage for w in config.wheel if w.name in rig.wheels)
         both = "yes: torque and draft over varied load and slip"
