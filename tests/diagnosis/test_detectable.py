@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from soilbus.config.model import Config
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.fitted_model import fit_model
@@ -20,7 +21,7 @@ from soilbus.estimation.solver import Termination
 from soilbus.report.statement import pressure_error
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.reference import REAR_DRIVE, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import soil_named
@@ -37,12 +38,12 @@ STEADY = Scenario(
 VALIDATED = ("slip_sinkage", "torque_lag", "multipass", "rolling_radius")
 
 
-def driven(scenario: Scenario, seed: int, *effects: str, without: str = "") -> Record:
-    rig = rig_of(CONFIG)
-    store = Bins(rig, 0.1, 0.0)
-    channels = simulate(with_effects(CONFIG, effects), scenario, seed=seed).channels
+def driven(scenario: Scenario, seed: int, *effects: str, without: str = "", config: Config = CONFIG) -> Record:
+    rig = rig_of(config)
+    store = Bins(rig, config.estimator.bin, 0.0)
+    channels = simulate(with_effects(config, effects), scenario, seed=seed).channels
     store.add({n: (c.t, c.value) for n, c in channels.items() if n in rig.channels and n != without})
-    return record_of("drive", store.window(0.0, scenario.duration), rig, model_of(CONFIG), 0.2, 0.15)
+    return record_of("drive", store.window(0.0, scenario.duration), rig, model_of(config), 0.2, 0.15)
 
 
 class Found(NamedTuple):
@@ -107,6 +108,19 @@ def shown_by(record: Record) -> tuple[Detectable, ...]:
     assert base is not None
     candidates = [CATALOGUE[n] for n in ("torque_lag", "multipass", "slip_sinkage", "draft_offset", "draft_gain")]
     return detectable([record], PRIOR, base, candidates)
+
+
+def test_a_loss_before_one_motor_that_the_soil_imitates_is_not_said_to_show():
+    """A loss of 6 % explains nothing here; one that fades with torque would show at a tenth of what is needed."""
+    config = reference_configuration(path=REAR_DRIVE)
+    loss = CATALOGUE["drivetrain_loss"]
+    record = driven(RICH, 1, "drivetrain_loss=0.06", config=config)
+    without, beside = (fit_model([record], prior_of(config), effects) for effects in ((), (loss,)))
+    assert without is not None
+    assert beside is not None
+    assert without.neg2_log_evidence - beside.neg2_log_evidence < 12.0
+    (shown,) = detectable([record], prior_of(config), without, [loss])
+    assert shown.size is None or shown.size > 0.06
 
 
 def test_where_no_effect_is_left_none_could_be_shown():

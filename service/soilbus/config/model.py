@@ -236,8 +236,8 @@ class Vehicle(_Section):
     track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
     """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
     towing: Literal["measured", "never", "unknown"] = "measured"
-    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows in full: then
-    `signals.draft` is not used, and there is no GO."""
+    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows in full:
+    `signals.draft` is not used then, and there is no GO."""
     steering: Literal["wheels", "skid"] = "wheels"
     """By turned wheels, or by the speeds of the two sides, which lets the wheels slide sideways in every turn."""
     differential_lock: Signal | None = None

@@ -8,13 +8,14 @@ can (Schur complement).  An effect of that size is missed every other time, one 
 smaller one is not seen because the fit moves the soil instead, and nobody can exclude that it has: soil_error says by
 how much.
 
-All this is linear in the effect.  A size is too small where the effect is nonlinear far below it, and for delays where
-nothing but noise changes quickly: noise of torques counts as change there.
+All this is linear in the effect, whose other parameters are at their neutral values: a loss that fades with torque may
+show at a tenth of the size of one that does not, which the soil imitates.  A size is too small where the effect is
+nonlinear far below it, and for delays where nothing but noise changes quickly: noise of torques counts as change there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,6 @@ from soilbus.diagnosis.score import (
     NormalEquations,
     joint_equations,
     normal_equations,
-    shifted_effects,
 )
 from soilbus.diagnosis.search import excess_without_effects, required_fall_beside, temperature_beside
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
@@ -76,31 +76,16 @@ def detectable(
     excess = excess_without_effects(records, prior, present)
     required = required_fall_beside(records, present, divisor, excess, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
-    found: dict[str, Detectable] = {}
-    for effects in _with_further_starts(candidates):
-        free = [f for effect in effects for f in parameters_of(effect, present.checks[0].problem.n_wheels)]
-        equations = normal_equations(records, prior, present, effects, free)
-        joint = joint_equations(equations)
-        for effect in effects:
-            columns = [i for i, f in enumerate(free) if f.effect == effect.name]
-            least = _sampling_delay(effect, records[-1])
-            one = _detectable(
-                effect, columns, [free[i] for i in columns], equations, joint, data_ratio, required, least, options
-            )
-            if effect.name not in found or _size(one) < _size(found[effect.name]):
-                found[effect.name] = one
-    return tuple(found[effect.name] for effect in candidates)
-
-
-def _with_further_starts(candidates: Sequence[Effect]) -> Iterator[list[Effect]]:
-    """The candidates, and then those with further starts at each of these."""
-    yield list(candidates)
-    for group in shifted_effects(candidates):
-        yield [one.shifted for one in group]
-
-
-def _size(one: Detectable) -> float:
-    return np.inf if one.size is None else one.size
+    free = [f for effect in candidates for f in parameters_of(effect, present.checks[0].problem.n_wheels)]
+    equations = normal_equations(records, prior, present, candidates, free)
+    joint = joint_equations(equations)
+    found = []
+    for effect in candidates:
+        columns = [i for i, f in enumerate(free) if f.effect == effect.name]
+        least = _sampling_delay(effect, records[-1])
+        own = [free[i] for i in columns]
+        found.append(_detectable(effect, columns, own, equations, joint, data_ratio, required, least, options))
+    return tuple(found)
 
 
 def _detectable(
