@@ -74,6 +74,7 @@ def window(reason: str, status: Status = Status.INVALID, **more) -> WindowResult
     ("reason", "says"),
     [
         ("input_missing load.FL draft", "no usable value of load.FL, draft ever came"),
+        ("input_missing wheels", "no wheel that drives has a torque and a speed mapped"),
         ("input_stale torque.RR", "torque.RR had pauses"),
         ("implausible ground_speed", "ground_speed contradicts the other sensors"),
         ("standstill", "drive"),

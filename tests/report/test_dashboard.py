@@ -542,3 +542,12 @@ def test_a_draft_that_no_sensor_shows_is_why_a_good_estimate_gives_no_state(desk
     desk.send("SoilbusStatus", State="valid", Reason="none", Window=7)
     desk.send("PresentDemand", Draft=draft)
     assert desk.dashboard.verdict().said == said
+
+
+def test_a_draft_that_was_shown_is_not_said_to_have_no_sensor(desk):
+    desk.send("Traversability", State="unknown")
+    desk.send("SoilbusStatus", State="valid", Reason="none", Window=7)
+    for draft in (1200.0, None):
+        desk.clock.now += 1.0
+        desk.send("PresentDemand", Draft=draft)
+    assert desk.dashboard.verdict().said == "UNKNOWN: the draft is not heard any more"

@@ -43,7 +43,10 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
         case "turning":
             return "the vehicle turned, so its wheels have no common ground speed: drive straight"
         case "input_missing":
-            return f"no usable value of {what} ever came: check the mapping, and that this bus carries it"
+            silent = ", ".join(name for name in names if name != "wheels")
+            said = [f"no usable value of {silent} ever came: check the mapping, and that this bus carries it"]
+            unmapped = ["no wheel that drives has a torque and a speed mapped, its own or its axle's"]
+            return "; ".join(said * bool(silent) + unmapped * ("wheels" in names))
         case "input_stale":
             return f"{what} had pauses: check the sender and the wiring, or set a timeout that fits its rate"
         case "implausible":

@@ -65,7 +65,9 @@ def configuration_warnings(config: Config) -> list[str]:
     elif quantities:
         lines.append(f"[noise] does not give {', '.join(quantities)}: the defaults below are assumed")
     if config.table is None and not rig_of(config).wheels:
-        lines.append("no wheel has torque, speed and load mapped: nothing can be estimated")
+        lines.append(
+            "no wheel that drives has a torque and a speed mapped, its own or its axle's: nothing can be estimated"
+        )
     elif config.table is None and config.signals.ground_speed is None:
         lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
     lines += _lines_of_vehicle(config)

@@ -258,7 +258,8 @@ class Dashboard:
             and not known.is_stale("PresentDemand")
             and known.number("PresentDemand", "Draft") is None
         ):
-            return "no sensor shows the draft", "Go carefully"
+            was_there = any("draft" in values for _, values in self._samples)
+            return "the draft is not heard any more" if was_there else "no sensor shows the draft", "Go carefully"
         if reason in REASONS:
             return REASONS[reason]
         if known.value("SoilbusStatus", "State") == "estimating":
