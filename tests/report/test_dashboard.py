@@ -548,6 +548,6 @@ def test_a_draft_that_was_shown_is_not_said_to_have_no_sensor(desk):
     desk.send("Traversability", State="unknown")
     desk.send("SoilbusStatus", State="valid", Reason="none", Window=7)
     for draft in (1200.0, None):
-        desk.clock.now += 1.0
+        desk.clock.now += 0.2
         desk.send("PresentDemand", Draft=draft)
     assert desk.dashboard.verdict().said == "UNKNOWN: the draft is not heard any more"
