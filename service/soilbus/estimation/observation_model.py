@@ -730,10 +730,11 @@ class ObservationModel(Measurements):
         return np.asarray(sinkage(latents.entry_angle, self.rig.radius))
 
     def mean_sinkage(self, soil: Soil, gains: Array, latents: Latents) -> Array:
-        """Mean sinkage [m] of each wheel (W,); nan for a wheel that is never usable."""
-        known = self.usable.sum(0)
+        """Mean sinkage [m] of each wheel (W,); nan for one never usable, or that MAX_ENTRY_ANGLE does not carry."""
+        known, is_buried = self.usable.sum(0), latents.entry_angle >= MAX_ENTRY_ANGLE
+        depth = np.where(is_buried, np.nan, self.sinkages(soil, gains, latents))
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.where(self.usable, self.sinkages(soil, gains, latents), 0.0).sum(0) / known)
+            return np.asarray(np.where(self.usable, depth, 0.0).sum(0) / known)
 
     def standardised(self, at: Linearisation, gains: Array) -> tuple[Array, Array]:
         """Each residual given the others of its instant, over its sd, and its derivatives in the same units.

@@ -24,7 +24,7 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.vehicle import slip_ratio
-from soilbus.terra.wheel import sinkage
+from soilbus.terra.wheel import MAX_ENTRY_ANGLE, sinkage
 
 __all__ = ["Excitation", "contact_pressure", "excitation_of", "lacking", "loaded_depths", "sinkage_range"]
 
@@ -87,7 +87,7 @@ def loaded_depths(fit: Fit, rig: Rig) -> tuple[float, float]:
 def sinkage_range(fit: Fit, rig: Rig) -> tuple[float, float] | None:
     """The 5 % and 95 % quantiles of the sinkage [m] over wheels and instants; None where not known."""
     depth = sinkage(fit.optimum.latents.entry_angle, rig.radius)
-    known = depth[np.isfinite(depth)]
+    known = depth[np.isfinite(depth) & (fit.optimum.latents.entry_angle < MAX_ENTRY_ANGLE)]
     if not len(known):
         return None
     low, high = np.percentile(known, (5.0, 95.0)).tolist()
