@@ -46,6 +46,11 @@ def test_a_manifest_of_any_spreadsheet_is_read(text, named):
     assert named("m.CSV") == [("V 1", "a.log", 60.0)]
 
 
+def test_a_day_of_eight_digits_is_a_day(named):
+    Path("m.csv").write_text("log,start\na.log,20240501\n")
+    assert named("m.csv")[0][2] == 1714521600.0
+
+
 def test_cells_that_are_missing_are_not_their_text(named):
     pd.DataFrame({"log": ["a.log", "T7/b.log"], "vehicle": [7.0, None], "start": [60.0, None]}).to_parquet("m.pq")
     assert named("m.pq") == [("7", "a.log", 60.0), ("T7", "T7/b.log", None)]

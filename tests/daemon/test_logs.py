@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -325,3 +326,23 @@ def test_a_wild_sample_after_the_last_window_is_counted(lines, tmp_path):
     assert [w["rejected"] for w in windows] == [{}] * len(windows)
     assert pipeline.intake.refusals.total == {"outlier": 1}
     assert pipeline.intake.refusals.used == samples_in(some) - 1
+
+
+def test_a_log_keeps_the_stamps_of_a_clock_that_was_set_back(tmp_path):
+    messages = [can.Message(timestamp=t, arbitration_id=1, data=[1]) for t in (1.7e9, 1.7e9 + 1.0, 1.6e9, 1.6e9 + 1.0)]
+    write_log(messages, tmp_path / "a.log")
+    assert [m.timestamp for m in can.CanutilsLogReader(tmp_path / "a.log")] == [m.timestamp for m in messages]
+
+
+@pytest.mark.parametrize("by", [1e9, -1e7])
+def test_the_time_read_of_a_log_is_that_of_the_drive_where_its_clock_was_set(lines, tmp_path, by):
+    (tmp_path / "a.log").write_text("".join([*lines[:200], *moved(lines[200:], by)]))
+    read = recordings_of(CONFIG, DATABASE, [tmp_path / "a.log"], longest=600.0)
+    assert read.samples == recordings_of(CONFIG, DATABASE, [tmp_path / "a.log"]).samples
+
+
+def test_what_lies_before_the_damage_of_a_log_can_be_diagnosed(lines, tmp_path):
+    (tmp_path / "a.log").write_text("".join(lines)[:-40] + "(17000")
+    with pytest.raises(LogError):
+        recordings_of(CONFIG, DATABASE, [tmp_path / "a.log"])
+    assert recordings_of(CONFIG, DATABASE, [tmp_path / "a.log"], partial=True).samples > 0.75 * samples_in(lines)

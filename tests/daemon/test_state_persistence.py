@@ -109,6 +109,18 @@ def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: P
     assert len(caplog.records) == 2
 
 
+def test_a_start_with_another_configuration_leaves_what_is_stored_until_it_knows_better(tmp_path: Path):
+    clock = FakeClock()
+    persistence_in(tmp_path, clock).close(BELIEF, {"frames": 3})
+    other_config = reference_configuration(["vehicle.mass=3100.0"])
+    other = Owner.of(other_config, Pipeline(other_config, DATABASE).intake.channels, DATABASE)
+    wrong = StatePersistence(tmp_path, other, InlineExecutor(), lambda: 1.7e9 + clock())
+    wrong.tick(clock(), None, lambda: {"frames": 1})
+    assert stored(tmp_path).totals == {"frames": 3}
+    wrong.close(Gaussian(other.median[:6], other.median[6:], np.diag(other.std**2)), {"frames": 2})
+    assert read(tmp_path / "state.json", other).totals == {"frames": 2}
+
+
 def test_counters_add_up_over_the_runs(tmp_path: Path):
     clock = FakeClock()
     for number in range(1, 4):

@@ -36,7 +36,7 @@ from soilbus.daemon.state_store import (
     write_whole,
 )
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.reference import REAR_DRIVE, reference_configuration
 
 
 def owner_of(settings: list[str] | None = None, database=None) -> Owner:
@@ -234,6 +234,15 @@ def test_a_belief_that_could_not_be_read_back_is_not_stored():
 )  # fmt: skip
 def test_what_a_belief_depends_on_is_in_the_key(setting):
     assert owner_of([setting]).key != OWNER.key
+
+
+def test_the_differential_of_an_axle_is_in_the_key():
+    def key(*settings: str) -> str:
+        config = reference_configuration(settings, REAR_DRIVE)
+        database = load_databases(config)
+        return Owner.of(config, channels_of(config, database), database).key
+
+    assert len({key(), key("axle.rear.differential=limited"), key("axle.rear.torque_bias=0.2")}) == 3
 
 
 def test_the_wiring_is_in_the_key_down_to_the_bit():

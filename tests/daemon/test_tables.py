@@ -112,7 +112,7 @@ def test_the_slips_error_is_that_of_one_less_the_ratio_of_speeds():
 
 
 def test_rows_without_load_or_slip_are_left_out_and_counted(tmp_path):
-    columns = {"load": [900, "", 900, 900, -5], "slip": [0.1, 0.2, "", 0.99, 0.3], "pull": 5, "torque": 6, "sink": 0.01}
+    columns = {"load": [900, "", 900, 900, -5], "slip": [0.1, 0.2, "", 1.0, 0.3], "pull": 5, "torque": 6, "sink": 0.01}
     columns = {k: v if isinstance(v, list) else [v] * 5 for k, v in columns.items()}
     (run,) = runs_of(rig(), write_csv(tmp_path / "a.csv", columns))
     assert len(run.window.t) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from types import SimpleNamespace
 
@@ -146,3 +147,9 @@ def test_names_beside_a_present_model_that_did_not_converge_are_no_finding():
     assert "the fit of the present model did not converge" in (doubt(before) or "")
     assert doubt(Diagnosis(Verdict.NAMED, (PLACE,), added, NOTHING, OPEN_END, (), *gaps)) is None
     assert doubt(Diagnosis(Verdict.NAMED, (PLACE,), added, NOTHING, NOTHING, (), *gaps)) is None
+
+
+@pytest.mark.parametrize("gap", [math.inf, math.nan])
+def test_a_gap_that_is_no_number_is_unknown_and_not_none(gap):
+    assert verdict_of(gap, gap, 500, []) is Verdict.UNKNOWN
+    assert verdict_of(2.0, gap, 500, [0.99]) is Verdict.UNKNOWN

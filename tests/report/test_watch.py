@@ -94,6 +94,19 @@ def test_a_stamp_that_goes_back_holds_nothing_up():
     assert log.is_over
 
 
+def test_a_clock_that_was_set_while_recording_holds_nothing_up():
+    """By NTP an hour after the start, and back again."""
+    clock = FakeClock()
+    messages, begin = sent(1.0) + sent(1.0) + sent(1.0), clock.now
+    third = len(messages) // 3
+    for message in messages[third : 2 * third]:
+        message.timestamp += 1.7e9
+    log = PlayedLog(messages, 1.0, clock, clock.sleep)
+    taken = [log.receive(100.0) for _ in messages]
+    assert taken == messages
+    assert clock.now - begin < 3.0 + 60.0
+
+
 def test_the_end_of_a_recording_ends_it_and_its_silences_are_silences():
     clock = FakeClock()
     late = sent(2.0)

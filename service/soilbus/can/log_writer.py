@@ -46,5 +46,7 @@ def write_log(messages: Iterable[can.Message], path: Path) -> None:
         packed = gzip.GzipFile(fileobj=raw, mode="wb") if is_packed else raw
         file = packed if kind == ".blf" else io.TextIOWrapper(packed, encoding="utf-8")
         with _WRITERS[kind](file) as log:
+            if kind == ".log":
+                log.last_timestamp = 0.0  # it is the least stamp that candump's writer leaves as it is
             for message in messages:
                 log(message)

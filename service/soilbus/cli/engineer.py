@@ -316,7 +316,7 @@ def diagnose(args: argparse.Namespace) -> None:
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
-    from soilbus.offline.replay import LogError
+    from soilbus.offline.replay import LogError, other_channel
     from soilbus.report.findings import findings_json, findings_text
     from soilbus.report.progress import phases
 
@@ -327,9 +327,11 @@ def diagnose(args: argparse.Namespace) -> None:
         _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
     check_outputs(args.json, args.report, args.model_out, args.manoeuvre_out, read=_read_files(args, config))
+    for line in other_channel(config, args.logs) if config.table is None else []:
+        say(line)
     try:
-        with phases("diagnose") as say:
-            findings = diagnose_logs(config, args.logs, say)
+        with phases("diagnose") as phase:
+            findings = diagnose_logs(config, args.logs, phase)
     except (LogError, NotFitted, TooLittle) as error:
         raise WorkError(str(error)) from None
     texts: list[tuple[Path, str]] = []

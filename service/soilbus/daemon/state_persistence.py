@@ -16,7 +16,17 @@ from concurrent.futures import Executor, Future, wait
 from pathlib import Path
 from typing import NamedTuple
 
-from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, read, stored_gaussian, write_whole
+from soilbus.daemon.state_store import (
+    OtherOwner,
+    Owner,
+    State,
+    StateError,
+    dumped,
+    gaussian_of,
+    read,
+    stored_gaussian,
+    write_whole,
+)
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.words import one_line
@@ -54,6 +64,7 @@ class StatePersistence:
 
     def __init__(self, folder: Path, owner: Owner, writer: Executor, wall: Callable[[], float] = time.time) -> None:
         self._path, self._owner, self._writer, self._wall = folder / FILE, owner, writer, wall
+        self._is_of_other = False
         self._previous = self._read()
         self._stored = None if self._previous is None else self._previous.gaussian
         self._seen: Gaussian | None = None
@@ -101,6 +112,7 @@ class StatePersistence:
         try:
             return read(self._path, self._owner)
         except StateError as error:
+            self._is_of_other = isinstance(error, OtherOwner)
             log.warning("stored state %s is not used, the estimate begins afresh: %s", self._path, error)
             return None
 
@@ -118,6 +130,8 @@ class StatePersistence:
             except StateError as error:
                 log.info("the present posterior is not stored: %s", error)
         previous = self._previous
+        if self._is_of_other and self._stored is None:
+            return  # it stays until there is a posterior to store: the configuration may be given by mistake
         totals = Counter(counts) + Counter({} if previous is None else previous.totals)
         starts = 1 if previous is None else previous.starts + 1
         try:

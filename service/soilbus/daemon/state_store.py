@@ -38,13 +38,17 @@ MAX_FILE_BYTES = 1 << 20
 """Size [bytes] beyond which a file is not a state of ours."""
 STORED_RANGE_SD = 8.0
 """Greatest distance of a stored mean from the prior's median, and greatest stored sd, in prior standard deviations."""
-SECTIONS = {"vehicle", "wheel", "track", "signals", "noise", "soil", "estimator", "model"}
+SECTIONS = {"vehicle", "axle", "wheel", "track", "signals", "noise", "soil", "estimator", "model"}
 """Sections of the configuration that a posterior depends on."""
 _PHI = PARAMETERS.index("phi")
 
 
 class StateError(Exception):
     """A stored state cannot be used; one line on why."""
+
+
+class OtherOwner(StateError):
+    """A stored state is sound, and another vehicle's or another configuration's."""
 
 
 class _Model(BaseModel):
@@ -217,7 +221,7 @@ def loaded(content: bytes, owner: Owner) -> State:
         if file.checksum != digest(file.state):
             raise StateError("it is damaged: wrong checksum")
         if file.key != owner.key:
-            raise StateError("it belongs to another configuration")
+            raise OtherOwner("it belongs to another configuration")
         state = State.model_validate(file.state)
     except (ValidationError, ValueError, RecursionError, OverflowError) as error:
         raise StateError(f"it is damaged: {_damage(error)}") from None

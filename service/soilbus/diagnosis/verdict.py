@@ -71,7 +71,8 @@ def verdict_of(
 
 def is_unexplained(before: float, after: float, checked_rows: int, options: DiagnosisOptions = DEFAULT) -> bool:
     """Whether a gap (reduced chi-square) remains that the effects added do not explain."""
-    return after > gap_limit(checked_rows, options) and after - 1.0 > options.max_unexplained_share * (before - 1.0)
+    is_explained = math.isfinite(after) and after - 1.0 <= options.max_unexplained_share * (before - 1.0)
+    return not (after <= gap_limit(checked_rows, options) or is_explained)
 
 
 def gap_limit(rows: int, options: DiagnosisOptions = DEFAULT) -> float:

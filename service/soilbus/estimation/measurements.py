@@ -108,7 +108,7 @@ class Measurements:
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
-            turns = (rim_speed > 0.0) & (np.abs(slip) < self.options.measurements.max_slip)
+            turns = (rim_speed > 0.0) & (np.abs(slip) < 1.0)
             usable = straight[:, None] & (window.load > 0.0) & (turns | ~rig.drives)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))

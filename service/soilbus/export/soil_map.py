@@ -14,7 +14,7 @@ from typing import Any
 from soilbus.config.model import Config, ConfigError
 from soilbus.estimation.posterior import Estimate
 from soilbus.pipeline.outputs import known
-from soilbus.pipeline.result import WindowResult
+from soilbus.pipeline.result import WindowResult, is_date
 
 DEGREE_DECIMALS = 7
 """Decimals of a degree: the seventh is a centimetre."""
@@ -78,10 +78,7 @@ def _properties(result: WindowResult) -> dict[str, Any]:
 
 def _time(t: float) -> str | None:
     """ISO 8601; None for a time stamp [s] that is no date."""
-    try:
-        return datetime.fromtimestamp(t, UTC).isoformat(timespec="milliseconds")
-    except (ValueError, OverflowError, OSError):
-        return None
+    return datetime.fromtimestamp(t, UTC).isoformat(timespec="milliseconds") if is_date(t) else None
 
 
 def _value_std(name: str, unit: str, estimate: Estimate | None, factor: float) -> dict[str, float | None]:

@@ -80,7 +80,13 @@ def arrow_table(rows: Rows, schema: Any) -> Any:
     """A pyarrow table of rows under a schema; null where a row has no value of that name."""
     import pyarrow as pa
 
-    return pa.Table.from_arrays([pa.array([row.get(f.name) for row in rows], f.type) for f in schema], schema=schema)
+    columns = [pa.array([_as_utf8(row.get(f.name)) for row in rows], f.type) for f in schema]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _as_utf8(value: Any) -> Any:
+    """A text that is no UTF-8, as the name of a file may be, with its codes shown; another value as it is."""
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
 def _described(name: str) -> tuple[Kind, str]:

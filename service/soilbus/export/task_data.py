@@ -166,9 +166,10 @@ def _root(name: str) -> ElementTree.Element:
 
 
 def _add_task(root: ElementTree.Element, n: int, log: str, windows: Sequence[WindowResult]) -> ElementTree.Element:
-    """A finished task: from the first to the last window of a log."""
+    """A finished task: from the earliest to the latest window of a log."""
     task = ElementTree.SubElement(root, "TSK", A=f"TSK{n}", B=f"soilbus {log}"[:32], G="4")
-    begin, end = (datetime.fromtimestamp(w.t, UTC).strftime("%Y-%m-%dT%H:%M:%SZ") for w in (windows[0], windows[-1]))
+    times = [w.t for w in windows]  # the clock may be set back
+    begin, end = (datetime.fromtimestamp(t, UTC).strftime("%Y-%m-%dT%H:%M:%SZ") for t in (min(times), max(times)))
     ElementTree.SubElement(task, "TIM", A=begin, B=end, D="4")
     return task
 

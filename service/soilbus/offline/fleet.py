@@ -70,7 +70,7 @@ def findings_of(jobs: Sequence[Job], version: str, given: Given) -> dict[str, An
     for job in jobs:
         try:
             with local_log(job) as path:
-                read = recordings_of(config, database, [path], longest=LONGEST).records
+                read = recordings_of(config, database, [path], longest=LONGEST, partial=True).records
         except (LogError, TooLittle, OSError) as error:
             record["left_out"].append({"log": job.log, "fault": one_line(error, 200)})
             continue

@@ -16,13 +16,14 @@ from fnmatch import fnmatchcase
 from functools import partial
 from io import BytesIO, TextIOWrapper
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from soilbus.config.model import Config
 from soilbus.offline import dataset
 from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
 from soilbus.offline.tables import MISSING_CELLS
+from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
 LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
@@ -112,7 +113,8 @@ def _lies_in(log: str, place: str) -> bool:
     pattern = _absolute(place).rstrip("/")
     if not glob.has_magic(pattern):
         return log.startswith(f"{pattern}/")
-    return fnmatchcase(log, pattern) or fnmatchcase(log, f"{pattern}/*")
+    places = PurePosixPath(log), *PurePosixPath(log).parents
+    return any(fnmatchcase(str(each), pattern) if "**" in pattern else each.match(pattern) for each in places)
 
 
 def _absolute(log: str) -> str:
@@ -215,14 +217,16 @@ def _parquet_rows(file: IO[bytes]) -> tuple[list[str], list[tuple[int, dict[str,
 def _start(text: str | None, manifest: str) -> float | None:
     if not text or text.lower() in MISSING_CELLS:
         return None
+    seconds = math.nan
     with suppress(ValueError):
-        if math.isfinite(seconds := float(text)):
-            return seconds
-    try:
-        when = datetime.fromisoformat(text)
-    except ValueError:
-        raise BatchError(f"{manifest}: start {text} is neither ISO 8601 nor seconds since 1970") from None
-    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+        seconds = float(text)  # a day may look so, too: 20240501
+    with suppress(ValueError):
+        if not is_date(seconds):
+            when = datetime.fromisoformat(text)
+            return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+    if not math.isfinite(seconds):
+        raise BatchError(f"{manifest}: start {text} is neither ISO 8601 nor seconds since 1970")
+    return seconds
 
 
 def _files(log: str, suffixes: Sequence[str]) -> list[str]:

@@ -391,7 +391,8 @@ class _Summary:
             self._bearing_n += 1
         if self.config.table is not None:
             self._rejected += Counter(result.rejected)
-        self._times = [self._times[0] if self._times else when, when] if when is not None else self._times
+        if when is not None:  # the clock may be set back
+            self._times = [min([when, *self._times[:1]]), max([when, *self._times[1:]])]
         return row
 
     def _time(self, t: float) -> int | None:

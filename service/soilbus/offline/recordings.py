@@ -14,11 +14,12 @@ from pathlib import Path
 
 from cantools.database.can import Database
 
+from soilbus.can.admission import LONGEST_GAP
 from soilbus.config.model import Config
 from soilbus.diagnosis.records import Record, TooLittle, record_of
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, rig_of
 from soilbus.estimation.window import Window
-from soilbus.offline.replay import fed, log_names
+from soilbus.offline.replay import LogError, fed, log_names
 from soilbus.pipeline.intake import Intake
 
 
@@ -53,6 +54,7 @@ def recordings_of(
     logs: Sequence[Path],
     progress: Callable[[int, float], None] | None = None,
     longest: float = math.inf,
+    partial: bool = False,
 ) -> Recordings:
     """Read logs.
 
@@ -66,6 +68,8 @@ def recordings_of(
         Called with the number of frames read and the time in the recording [s].
     longest
         Time [s] at the beginning of each log after which no more of it is read.
+    partial
+        Whether what lies before the damage of a log counts.
 
     Raises
     ------
@@ -84,7 +88,7 @@ def recordings_of(
         intake = Intake(config, database, {})
         first.append(len(records))
         fault: TooLittle | None = None
-        for i, window in enumerate(parts(intake, path, progress, longest)):
+        for i, window in enumerate(parts(intake, path, progress, longest, partial)):
             samples += window.samples
             name = log if i == 0 else f"{log}, part {i + 1}"
             try:
@@ -105,6 +109,7 @@ def parts(
     log: Path,
     progress: Callable[[int, float], None] | None = None,
     longest: float = math.inf,
+    partial: bool = False,
 ) -> Iterator[Window]:
     """The windows of a log, one for each stretch in which its clock was not set and it was not silent for long.
 
@@ -122,14 +127,19 @@ def parts(
             whole.append(window)
 
     intake.admission.at_break = end
-    first = math.nan
-    for now in fed(intake, log, progress):
-        yield from whole
-        whole.clear()
-        intake.ingest(now)
-        first = now if math.isnan(first) else first
-        if now - first > longest:
-            break
+    length, last = 0.0, math.nan
+    try:
+        for now in fed(intake, log, progress):
+            yield from whole
+            whole.clear()
+            intake.ingest(now)
+            length += 0.0 if math.isnan(last) else min(max(now - last, 0.0), LONGEST_GAP)  # the clock may be set
+            last = now
+            if length > longest:
+                break
+    except LogError:
+        if not partial or math.isnan(last):
+            raise
     end()
     yield from whole
 

@@ -17,7 +17,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from io import TextIOBase
 from itertools import chain, islice
@@ -319,7 +319,7 @@ def _estimate(task: WindowTask) -> Undecided:
 
 
 def other_channel(config: Config, logs: Iterable[Path]) -> list[str]:
-    """A line for each candump log whose first lines are of another channel than the configured one, or of several."""
+    """A line for each log whose first frames are of several channels, or a candump log's of another than configured."""
     lines = []
     for path in logs:
         names = _channels(path)
@@ -330,8 +330,11 @@ def other_channel(config: Config, logs: Iterable[Path]) -> list[str]:
 
 
 def _channels(path: Path) -> set[str]:
-    """Channels in the first lines of a candump log; none for other formats and what cannot be read."""
+    """Channels of the first frames of a log; none for what cannot be read, and for one channel under another format."""
     if ".log" not in path.suffixes[-2:]:
+        with suppress(LogError):
+            found = {f"channel {message.channel}" for message in islice(read_log(path), CHANNEL_SCAN_LINES)}
+            return found if len(found) > 1 else set()
         return set()
     try:
         with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as text:

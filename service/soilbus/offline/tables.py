@@ -199,14 +199,14 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
 def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Run:
     n = len(values["slip"])
     t = np.asarray(values.get("t", np.arange(n) * ROW_PERIOD), np.float64)
-    load, slip, usable = values["wheel_load"], values["slip"], rig.options.measurements
+    load, slip = values["wheel_load"], values["slip"]
     with np.errstate(invalid="ignore"):
         faults = {
             "no_load": ~np.isfinite(load),
             "no_slip": ~np.isfinite(slip),
             "no_time": ~np.isfinite(t),
             "load_range": load <= 0.0,
-            "slip_range": np.abs(slip) >= usable.max_slip,
+            "slip_range": np.abs(slip) >= 1.0,
         }
     reasons = [next((reason for reason, at in faults.items() if at[i]), "") for i in range(n)]
     kept = np.flatnonzero([not reason for reason in reasons])

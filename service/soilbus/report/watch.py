@@ -51,13 +51,17 @@ class Source(Protocol):
         """The next frame, or None after at most `timeout` [s]."""
 
 
+LONGEST_SILENCE = 60.0
+"""Time [s] between two frames of a recording beyond which its clock was set, or another drive begins."""
+
+
 class PlayedLog:
     """Frames of a recording, each when it is due.
 
     Parameters
     ----------
     messages
-        Frames in the order of their stamps; one that goes back is due at once.
+        In their order; one whose stamp goes back is due at once, and a silence takes LONGEST_SILENCE at most.
     speed
         Seconds of the recording per second.
     clock, sleep
@@ -76,6 +80,7 @@ class PlayedLog:
         self._messages, self._speed, self._clock, self._sleep = iter(messages), speed, clock, sleep
         self._next = next(self._messages, None)
         self._first = 0.0 if self._next is None else self._next.timestamp
+        self._shift = 0.0
         self._began = clock()
 
     @property
@@ -84,7 +89,7 @@ class PlayedLog:
         return self._next is None
 
     def now(self) -> float:
-        """Time [s] of the recording."""
+        """Time [s] of the recording, without the jumps of its clock."""
         return self._first + self._speed * (self._clock() - self._began)
 
     def receive(self, timeout: float, /) -> can.Message | None:
@@ -92,12 +97,15 @@ class PlayedLog:
         message = self._next
         if message is None:
             return None
-        wait = (message.timestamp - self.now()) / self._speed
+        wait = (message.timestamp - self._shift - self.now()) / self._speed
         if wait > 0.0:
             self._sleep(min(wait, timeout))
             if wait > timeout:
                 return None
         self._next = next(self._messages, None)
+        if self._next is not None:  # the recording's clock may be set
+            step = self._next.timestamp - message.timestamp
+            self._shift += step - min(max(step, 0.0), LONGEST_SILENCE)
         return message
 
 
