@@ -12,7 +12,7 @@ from soilbus.estimation.options import SearchOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import MAX_ENTRY_ANGLE, Soil
+from soilbus.terra.wheel import Soil
 
 QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
 
@@ -271,7 +271,7 @@ def test_a_wrong_gain_is_estimated_as_a_gain(wet_clay, wet_clay_fit):
 def test_a_wheel_that_no_entry_angle_carries_has_no_sinkage(wet_clay, wet_clay_fit):
     optimum = wet_clay_fit.optimum
     angle = optimum.latents.entry_angle.copy()
-    angle[np.flatnonzero(wet_clay.problem().usable[:, 1])[0], 1] = MAX_ENTRY_ANGLE
+    angle[np.flatnonzero(wet_clay.problem().usable[:, 1])[0], 1] = 1.5  # nearly a right angle
     depth = wet_clay.problem().mean_sinkage(
         Soil(*optimum.soil), optimum.gains, optimum.latents._replace(entry_angle=angle)
     )

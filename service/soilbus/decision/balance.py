@@ -337,8 +337,8 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
 
 def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
     """Sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), each times a factor (A, 1)."""
-    share = np.where(kinds, (axles.count * each)[:, 0], 0.0)
-    return np.asarray(np.einsum("a,daf->df", share, values))
+    share = (axles.count * each)[:, 0]
+    return np.asarray(np.einsum("a,daf->df", share[kinds], values[:, kinds]))
 
 
 def _columns(pull: Array, at: Iterable[Array]) -> Array:
