@@ -123,11 +123,11 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
     is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
-    is_gaussian = _agree(along.top.mode, averaged, options)
+    is_gaussian = _is_hardly_wider(along.top.mode, averaged, options)
     return replace(found, mode=along.top.mode, marginalised=averaged, is_gaussian=is_gaussian)
 
 
-def _agree(mode: Gaussian, averaged: Gaussian, options: PosteriorOptions) -> bool:
+def _is_hardly_wider(mode: Gaussian, averaged: Gaussian, options: PosteriorOptions) -> bool:
     """Whether the average along n is hardly wider than the Gaussian at the mode, in any direction."""
     free = np.flatnonzero(np.diag(mode.covariance) > 0.0)
     own, wide = (b.covariance[np.ix_(free, free)] for b in (mode, averaged))

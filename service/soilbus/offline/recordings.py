@@ -74,7 +74,7 @@ def recordings_of(
     Raises
     ------
     LogError
-        A log cannot be read to its end, or is of another bus.
+        A log cannot be read to its end (with `partial`: at all), or is of another bus.
     TooLittle
         A log has no usable part.
     ConfigError
@@ -116,7 +116,7 @@ def parts(
     Raises
     ------
     LogError
-        The log cannot be read to its end.
+        The log cannot be read to its end; with `partial` only where nothing of it can.
     """
     whole: list[Window] = []
 

@@ -22,6 +22,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from soilbus.can.admission import LONGEST_GAP
 from soilbus.can.bus import LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.can.wire import Received
@@ -51,17 +52,13 @@ class Source(Protocol):
         """The next frame, or None after at most `timeout` [s]."""
 
 
-LONGEST_SILENCE = 60.0
-"""Time [s] between two frames of a recording beyond which its clock was set, or another drive begins."""
-
-
 class PlayedLog:
     """Frames of a recording, each when it is due.
 
     Parameters
     ----------
     messages
-        In their order; one whose stamp goes back is due at once, and a silence takes LONGEST_SILENCE at most.
+        In their order; one whose stamp goes back is due at once, and a silence takes LONGEST_GAP at most.
     speed
         Seconds of the recording per second.
     clock, sleep
@@ -105,7 +102,7 @@ class PlayedLog:
         self._next = next(self._messages, None)
         if self._next is not None:  # the recording's clock may be set
             step = self._next.timestamp - message.timestamp
-            self._shift += step - min(max(step, 0.0), LONGEST_SILENCE)
+            self._shift += step - min(max(step, 0.0), LONGEST_GAP)
         return message
 
 

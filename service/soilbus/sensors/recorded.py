@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.can.admission import Admission
+from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.channels import Reason
 
 Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
@@ -19,8 +19,6 @@ Columns = dict[str, tuple[Array, Array]]
 
 BATCH_SIZE = 5000
 """Number of frames that are decoded at a time."""
-LONGEST_SILENCE = 60.0
-"""Time [s] without a frame, or jump back, after which another part begins; the part with most samples is compared."""
 
 
 def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns, Counter[tuple[str, Reason]], int]:
@@ -52,7 +50,7 @@ def _parts(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns]
         n += 1
         if error:
             continue
-        if abs(t - last) > LONGEST_SILENCE:
+        if abs(t - last) > LONGEST_GAP:
             take()
             pieces.append([])
         last = t
