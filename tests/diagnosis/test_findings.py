@@ -47,7 +47,10 @@ def findings() -> Findings:
     base, completed = (fit_model([record], prior_of(CONFIG), effects) for effects in ((), (OFFSET.effect,)))
     assert base is not None
     assert completed is not None
-    where = (Disagreement("draft", "", "slip 0.20..0.35", 312.0, 0.0), Disagreement("load", "FL", "gain", 0.031, 1e-5))
+    where = (
+        Disagreement("draft", "", "slip 0.20..0.35", 312.0, significance=0.0),
+        Disagreement("load", "FL", "gain", 0.031, significance=1e-5),
+    )
     diagnosis = Diagnosis(Verdict.AMBIGUOUS, where, (OFFSET,), base, completed, (), Gap(1.234, 900), Gap(1.012, 900))
     recordings = Recordings((record,), (0,), 1234, {"bad_checksum": 7}, ("<a & b>.log, part 2",))
     return Findings(diagnosis, recordings, CONFIG, 1.5)

@@ -26,7 +26,7 @@ from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import soil_named
 
 CONFIG = reference_configuration()
-PLACE = Disagreement("draft", "", "slip 0.20..0.35", 312.0, 1e-5)
+PLACE = Disagreement("draft", "", "slip 0.20..0.35", 312.0, significance=1e-5)
 SOIL = Posterior(soil_named("loam"), np.diag([0.3, 0.02, 0.01, 0.005, 0.1, 0.02]) ** 2)
 NOTHING = SimpleNamespace(fits=[SimpleNamespace(posterior=SOIL)], converged=True, at_limits=())
 OPEN_END = SimpleNamespace(fits=NOTHING.fits, converged=False, at_limits=())

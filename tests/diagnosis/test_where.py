@@ -13,31 +13,32 @@ from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)
+AXLES = reference_configuration(path=REFERENCES["tractor-axles"])
 SOILS = ("loam", "wet_clay", "dry_sand")
 
 
-def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None, rig=RIG) -> Record:
+def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None, rig=RIG, config=CONFIG) -> Record:
     """A drive; `error` gives what a channel reads too much from times, slips and speeds of the truth."""
-    recording = simulate(CONFIG, excited(soil, seconds), seed=seed)
-    columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in RIG.channels}
+    recording = simulate(config, excited(soil, seconds), seed=seed)
+    columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels}
     if error is not None:
         t, value = columns[channel]
         truth = {n: np.interp(t, recording.truth["t"], recording.truth[n]) for n in ("slip.RL", "ground_speed")}
         columns[channel] = t, value + error(t, truth["slip.RL"], truth["ground_speed"])
     store = Bins(rig, 0.1, 0.0)
     store.add(columns)
-    return record_of("drive", store.window(0.0, seconds), rig, model_of(CONFIG), 0.2, 0.15)
+    return record_of("drive", store.window(0.0, seconds), rig, model_of(config), 0.2, 0.15)
 
 
 def places(record: Record) -> list[Disagreement]:
     base = fit_model([record], prior_of(CONFIG), ())
     assert base is not None
-    return disagreements(base)
+    return disagreements([record], base)
 
 
 def test_where_nothing_is_missing_no_place_is_reported():
@@ -90,3 +91,29 @@ def test_significances_are_of_all_tests_together_and_the_clearest_comes_first():
     reported = [place.significance for place in places(recorded("loam", 60.0, 3, "torque.RL", error))]
     assert reported == sorted(reported)
     assert max(reported) <= 0.01
+
+
+def test_regions_of_an_axles_torque_are_of_its_own_wheels():
+    """The rear motor reads too much at great slip of the rear wheels; the front right one has slips of its own."""
+    error = lambda t, slip, speed: np.where(slip > 0.25, 1500.0, 0.0)  # noqa: E731
+    record = recorded("loam", 60.0, 3, "torque.rear", error, rig_of(AXLES), AXLES)
+    base = fit_model([record], prior_of(AXLES), ())
+    assert base is not None
+    found = [p for p in disagreements([record], base) if (p.channel, p.wheel) == ("torque", "rear")]
+    thirds = {tuple(map(float, p.region[5:].split(".."))): p.size for p in found if p.region.startswith("slip ")}
+    (low, _), (_, high) = min(thirds), max(thirds)
+    of_rear = record.held_out.slip[:, 2:].mean(axis=1)
+    assert low == pytest.approx(of_rear.min(), abs=0.01)
+    assert high == pytest.approx(of_rear.max(), abs=0.01)
+
+
+def test_a_place_names_its_recording():
+    error = lambda t, slip, speed: 250.0 * (t > 40.0)  # noqa: E731
+    records = [
+        dataclasses.replace(recorded("loam", 60.0, seed, channel, error if channel else None), name=name)
+        for seed, channel, name in ((4, "", "sound.log"), (3, "torque.RL", "late.log"))
+    ]
+    base = fit_model(records, prior_of(CONFIG), ())
+    assert base is not None
+    found = disagreements(records, base)
+    assert (found[0].channel, found[0].wheel, found[0].log) == ("torque", "RL", "late.log")

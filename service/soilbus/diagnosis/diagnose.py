@@ -137,7 +137,7 @@ def diagnose(
     thinned = FitCache([record.thinned(options.thinning) for record in records], prior, options)
     law = records[0].training.model.shear_law
     candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
-    where, present = disagreements(base, options), base
+    where, present = disagreements(records, base), base
     additions: list[Addition] = []
     progress("looking for effects")
     search = Search(full, thinned, base, candidates, options)

@@ -258,11 +258,10 @@ def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
     measured = problem.readings
     modelled = measured - held_out.at.rows[:, RESIDUAL].reshape(measured.shape)
     slip = 1.0 - latents.ground_speed[:, None] / (problem.rig.radius * latents.speed)
-    wheels, found = list(problem.rig.wheels), []
-    for i, (channel, wheel) in enumerate(problem.row_channels):
+    found = []
+    for i, ((channel, wheel), wheels) in enumerate(zip(problem.row_channels, problem.row_wheels, strict=True)):
         known = np.isfinite(standardised[:, i])
-        one = wheels.index(wheel) if wheel in wheels else None
-        of_slip, of_load = (values.mean(1) if one is None else values[:, one] for values in (slip, latents.load))
+        of_slip, of_load = (values[:, wheels].mean(1) for values in (slip, latents.load))
         of_row = measured[:, i], modelled[:, i], standardised[:, i]
         columns = *of_row, of_slip, of_load, latents.ground_speed, problem.since
         if known.any():
@@ -595,9 +594,7 @@ def _held_at_edges(
 
 
 def _start(fit: Fit, held_out: Latents | None = None) -> Start:
-    """A start where a fit ended; with its latents if it converged."""
-    if not fit.converged:
-        return Start(fit.mode.soil, fit.mode.gains)
+    """A start where a fit ended, with its latents."""
     return Start(fit.mode.soil, fit.mode.gains, True, fit.optimum.latents, held_out)
 
 

@@ -96,16 +96,15 @@ def _samples(
 def _sample(
     problem: ObservationModelWithEffects, at: Linearisation, latents: Latents, gains: Array, column: int
 ) -> _Sample:
-    """Residuals of one column with the regressors of its wheel, or their means over wheels for the draft."""
+    """Residuals of one column with the regressors of its wheels, their means where it has several."""
     z, _ = problem.standardised(at, gains)
-    W, r = problem.n_wheels, problem.rig.radius
+    r, own = problem.rig.radius, problem.row_wheels[column]
     known = np.isfinite(z[:, column])
     raw = at.rows[:, 0].reshape(z.shape)[:, column]
     scale = np.abs(raw[known]).sum() / max(float(np.abs(z[known, column]).sum()), 1e-12)
-    own = None if column == W else column % (W + 1)
     slip = 1.0 - latents.ground_speed[:, None] / (r * latents.speed)
     wheels = {"slip": slip, "load": latents.load / latents.load.mean(0), "sinkage": sinkage(latents.entry_angle, r)}
-    by = {name: (v.mean(1) if own is None else v[:, own]) for name, v in wheels.items()}
+    by = {name: v[:, own].mean(1) for name, v in wheels.items()}
     by["sinkage"] = by["sinkage"] / by["sinkage"].mean()
     by["load"] = by["load"] - 1.0
     by["speed"] = latents.ground_speed / latents.ground_speed.mean() - 1.0
@@ -113,7 +112,7 @@ def _sample(
     by["acceleration"] = problem.acceleration
     by["draft"] = problem.draft / max(float(np.abs(problem.draft).mean()), 1e-9)
     products = {f"{a} {b}": by[a] * by[b] for a, b in (("slip", "slip"), ("slip", "load"), ("slip", "speed"))}
-    angle = problem.wheel_angle.mean(1) if own is None else problem.wheel_angle[:, own]
+    angle = problem.wheel_angle[:, own].mean(1)
     waves = {f"{f.__name__}({k} wheel angle)": f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)}
     regressors = {"1": np.ones(len(z))} | by | products | waves
     return _Sample(z[known, column], np.full(int(known.sum()), scale), {n: v[known] for n, v in regressors.items()})

@@ -11,8 +11,8 @@ soil, gains and effects.  Each region is one test; the significance reported is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck
-from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
+from soilbus.diagnosis.options import DiagnosisOptions
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.posterior import PARAMETERS
 
 _SOIL = len(PARAMETERS)
@@ -42,6 +44,8 @@ class Disagreement:
         `gain`.
     size
         Mean of reading less model [SI]; of a scatter the residuals' std over the noise's, of a gain the gain error.
+    log
+        Name of the recording; empty for a gain, which all of them share.
     significance
         Probability that noise alone does as much in any of the tests.
     """
@@ -50,47 +54,42 @@ class Disagreement:
     wheel: str
     region: str
     size: float
-    significance: float
+    log: str = ""
+    significance: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Test:
-    """One test, with its statistic in standard deviations."""
-
-    channel: str
-    wheel: str
-    region: str
-    size: float
-    deviations: float
-
-
-def disagreements(fitted: FittedModel, options: DiagnosisOptions = DEFAULT) -> list[Disagreement]:
-    """All significant disagreements of the held-out blocks, the clearest first."""
-    tests = [test for i, check in enumerate(fitted.checks) for test in _tests(check, fitted, i, options)]
+def disagreements(records: Sequence[Record], fitted: FittedModel) -> list[Disagreement]:
+    """All significant disagreements of a model with the held-out blocks of its recordings, the clearest first."""
+    options = records[0].options
+    tests = [
+        test
+        for record, check, fit in zip(records, fitted.checks, fitted.fits, strict=True)
+        for test in _tests(record.name, check, fit.mode, options)
+    ]
     tests += list(_gain_tests(fitted, options))
-    tests.sort(key=lambda test: -abs(test.deviations))
+    tests.sort(key=lambda test: -abs(test[0]))
     found, worst = [], 0.0
-    for rank, test in enumerate(tests):
-        worst = max(worst, min(1.0, math.erfc(abs(test.deviations) / math.sqrt(2.0)) * (len(tests) - rank)))
+    for rank, (deviations, place) in enumerate(tests):
+        worst = max(worst, min(1.0, math.erfc(abs(deviations) / math.sqrt(2.0)) * (len(tests) - rank)))
         if worst > options.significance:
             break
-        found.append(Disagreement(test.channel, test.wheel, test.region, test.size, worst))
+        found.append(replace(place, significance=worst))
     return found
 
 
-def _tests(check: HeldOutCheck, fitted: FittedModel, record: int, options: DiagnosisOptions) -> Iterator[_Test]:
-    """The tests of one recording: mean by region, and scatter, of each channel."""
-    problem, gaussian = check.problem, fitted.fits[record].mode
+def _tests(
+    log: str, check: HeldOutCheck, gaussian: Gaussian, options: DiagnosisOptions
+) -> Iterator[tuple[float, Disagreement]]:
+    """The tests of one recording, in standard deviations: mean by region, and scatter, of each channel."""
+    problem = check.problem
     z, slopes = problem.standardised(check.at, gaussian.gains)
     slopes = slopes * np.concatenate([gaussian.soil, np.ones(len(gaussian.gains))])
     raw = check.at.rows[:, 0].reshape(z.shape)
-    W = problem.n_wheels
     slip = 1.0 - check.latents.ground_speed[:, None] / (problem.rig.radius * check.latents.speed)
-    for i, (channel, wheel) in enumerate(problem.row_channels):
-        own = i % (W + 1) if i != W else None
+    for i, ((channel, wheel), wheels) in enumerate(zip(problem.row_channels, problem.row_wheels, strict=True)):
         regressors = {
-            "slip": slip.mean(1) if own is None else slip[:, own],
-            "load": check.latents.load.sum(1) if own is None else check.latents.load[:, own],
+            "slip": slip[:, wheels].mean(1),
+            "load": check.latents.load[:, wheels].sum(1),
             "speed": check.latents.ground_speed,
             "time": problem.since,
         }
@@ -99,7 +98,7 @@ def _tests(check: HeldOutCheck, fitted: FittedModel, record: int, options: Diagn
             n = len(members)
             mean, slope = z[members, i].mean(), slopes[members, i].mean(0)
             sd = math.sqrt(1.0 / n + float(slope @ gaussian.covariance @ slope))
-            yield _Test(channel, wheel, region, float(raw[members, i].mean()), mean / sd)
+            yield mean / sd, Disagreement(channel, wheel, region, float(raw[members, i].mean()), log)
         n = int(known.sum())
         if n >= options.where_residuals:
             square = float((z[known, i] ** 2).mean())
@@ -109,7 +108,7 @@ def _tests(check: HeldOutCheck, fitted: FittedModel, record: int, options: Diagn
             expected, of_squares = float(uncertain.trace()), float((uncertain @ uncertain).trace())
             sd = math.sqrt(2.0 * (n + 2.0 * expected + of_squares)) / n
             larger = max((square - 1.0 - expected / n) / sd, 0.0)  # smaller than noise is no disagreement
-            yield _Test(channel, wheel, "scatter", math.sqrt(square), larger)
+            yield larger, Disagreement(channel, wheel, "scatter", math.sqrt(square), log)
 
 
 def _regions(
@@ -131,7 +130,7 @@ def _regions(
                 yield f"{name} {low:.3g}..{high:.3g}", members
 
 
-def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[_Test]:
+def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tuple[float, Disagreement]]:
     """Tests of the gain errors against their priors: a fit may hide an effect in them."""
     problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
     for i in range(problem.n_sensors):
@@ -140,4 +139,4 @@ def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[_Tes
         if std > 0.0 and shift_variance > options.min_variance_share * std**2:
             quantity, _, wheel = problem.gain_names[i].partition(".")
             gain = float(gaussian.gains[i])
-            yield _Test(quantity, wheel, "gain", gain, gain / math.sqrt(shift_variance))
+            yield gain / math.sqrt(shift_variance), Disagreement(quantity, wheel, "gain", gain)

@@ -304,6 +304,13 @@ class Measurements:
         return names + ([("sinkage", wheel) for wheel in self.rig.wheels] if self.with_sinkage else [])
 
     @property
+    def row_wheels(self) -> list[list[int]]:
+        """Indices of the wheels of each residual of an instant: of the draft all of them."""
+        given, every = self.rig.instrumentation, range(self.n_wheels)
+        torques = [[i] for i in every] if given is None else [np.flatnonzero(r.weight).tolist() for r in given.torque]
+        return [*torques, [*every], *([i] for i in every if self.with_sinkage)]
+
+    @property
     def readings(self) -> Array:
         """What the sensors read in the rows of an instant (N, m): torques [N m], draft [N], sinkages [m]."""
         parts = [self.torque, self.draft[:, None]] + ([self.sinkage] if self.with_sinkage else [])

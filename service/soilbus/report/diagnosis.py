@@ -176,10 +176,10 @@ def _candidates(findings: Findings) -> Iterator[tuple[int, Table, str]]:
 
 def _places(findings: Findings) -> Table | None:
     rows = [
-        (p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance))
+        (p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance), p.log or "-")
         for p in findings.diagnosis.where
     ]
-    return Table(("channel", "wheel", "region", "size", "chance that noise does it"), rows) if rows else None
+    return Table(("channel", "wheel", "region", "size", "chance that noise does it", "log"), rows) if rows else None
 
 
 def _residuals(findings: Findings) -> list[Picture]:

@@ -108,7 +108,7 @@ def _shown(findings: Findings) -> dict[str, Any]:
 
 
 def _place(place: Disagreement) -> dict[str, Any]:
-    names = ("channel", "wheel", "region", "size", "significance")
+    names = ("channel", "wheel", "region", "size", "significance", "log")
     return {name: getattr(place, name) for name in names}
 
 
@@ -189,8 +189,11 @@ def place_lines(findings: Findings) -> list[str]:
     where = findings.diagnosis.where
     if not where:
         return [no_places(findings.diagnosis)]
+    has_several = len(findings.diagnosis.base.fits) > 1
     shown = [
-        f"{_channel(p)}, {p.region}: {size_text(p)} (chance {chance_text(p.significance)})" for p in where[:MAX_PLACES]
+        f"{f'{p.log}: ' if has_several and p.log else ''}{_channel(p)}, {p.region}: {size_text(p)} "
+        f"(chance {chance_text(p.significance)})"
+        for p in where[:MAX_PLACES]
     ]
     left = len(where) - len(shown)
     return [*shown, f"and {left} more"] if left else shown
