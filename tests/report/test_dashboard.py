@@ -224,6 +224,16 @@ def test_what_to_do_has_at_most_five_words_and_the_sentence_begins_with_the_stat
     assert {verdict.kind for *_, verdict in seen} == {"go", "caution", "no_go", "unknown", "warned", "gone"}
 
 
+def test_a_caution_that_only_waits_for_a_second_window_asks_for_no_less_draft(desk):
+    """The first good window after a no-go: probable enough for go, and held back by hysteresis alone."""
+    said = {}
+    for probability in (0.94, 0.97):
+        desk.send("SoilbusStatus", State="valid", Reason="none", Window=3)
+        desk.send("Traversability", State="caution", LimitingCause="traction", Probability=probability)
+        said[probability] = desk.dashboard.verdict().todo
+    assert said == {0.94: "Less draft, more load", 0.97: "Go slowly, still measuring"}
+
+
 def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():
     said = {}
     for reason in set(REASONS) - {"none", "model_gap", "error", "not_available"}:

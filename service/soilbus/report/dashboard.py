@@ -114,12 +114,15 @@ class Vehicle:
         Length of an estimation window [s].
     max_slip
         Slip at the end of the slip bar.
+    go
+        Probability from which the state is go, once enough windows say so.
     """
 
     wheels: tuple[str, ...] = ()
     axles: tuple[str | None, ...] = ()
     window: float = 10.0
     max_slip: float = 0.6
+    go: float = 0.95
 
     @classmethod
     def of(cls, config: Config, names_wheels: bool = True) -> Vehicle:
@@ -127,7 +130,7 @@ class Vehicle:
         wheels = config.wheel if names_wheels else []
         return cls(
             tuple(w.name for w in wheels), tuple(w.axle for w in wheels),
-            config.estimator.window, config.traversability.max_slip,
+            config.estimator.window, config.traversability.max_slip, config.traversability.go,
         )  # fmt: skip
 
     def name(self, wheel: int) -> str:
@@ -229,6 +232,8 @@ class Dashboard:
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
         limit = known.value("Traversability", "LimitingCause")
         todo = ADVICE.get((state, str(limit)), ADVICE[state, None])
+        if state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
+            todo = MEASURING  # nothing limits it: more windows must say the same
         return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
 
     def _because(self) -> Iterator[str]:
