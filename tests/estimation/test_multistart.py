@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.multistart import clip_to_prior, fit_from_soil, fit_warm, fit_window, starting_soils, warm_start
-from soilbus.estimation.options import SearchOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS
@@ -76,7 +75,7 @@ def test_errors_are_as_large_as_the_posterior_reports(simulated):
 def test_fits_from_unlike_soils_end_at_the_same_optimum(wet_clay, wet_clay_fit):
     problem, prior = wet_clay.problem(), wet_clay.prior
     unlike = ("loam", "clayey_soil_38", "dry_sand", "heavy_clay_40", "wet_clay")
-    for start in (Soil(*prior.median), *(clip_to_prior(prior, SOILS[name], SearchOptions()) for name in unlike)):
+    for start in (Soil(*prior.median), *(clip_to_prior(prior, SOILS[name]) for name in unlike)):
         fit = fit_from_soil(problem, prior, start)
         assert fit.converged
         assert fit.neg2_log_posterior == pytest.approx(wet_clay_fit.neg2_log_posterior, abs=0.01)

@@ -9,7 +9,6 @@ import pytest
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import clip_to_prior, fit_window
-from soilbus.estimation.options import SearchOptions
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import WITHIN_CLASS_SD, SoilClasses, guessed, ranked_by_likelihood
@@ -193,7 +192,7 @@ def test_the_classes_are_those_of_the_table_with_a_smaller_spread_than_the_table
 def test_the_true_soil_has_the_greatest_likelihood_of_the_table(simulated, sensors):
     without = {"all": (), "no sinkage": ("sinkage",), "no draft": ("draft",), "only torque": ("sinkage", "draft")}
     problem = simulated(SOILS["upland_sandy_loam_51"], 6, without=without[sensors]).problem()
-    soils = [clip_to_prior(PRIOR, SOILS[name], SearchOptions()) for name in KINDS]
+    soils = [clip_to_prior(PRIOR, SOILS[name]) for name in KINDS]
     order = [KINDS[soils.index(soil)] for soil in ranked_by_likelihood(problem, soils)]
     assert order[0] == "upland_sandy_loam_51"
     assert sorted(order) == sorted(KINDS)

@@ -285,7 +285,7 @@ def watched(
     Returns
     -------
     Watch
-        Its warning is unknown until the trends are `settling_time` old.
+        Its warning is unknown until the trends are `long_memory` old.
 
     Notes
     -----
@@ -299,7 +299,7 @@ def watched(
         before, step = _restarted(before, t)._replace(since=t), 0.0
     look = Look(t, common_slip(slips, options.slip_exponent), pull, pull - inertia)
     reserve = float(_reserve(curve, look.slip))
-    kept = before.recent[bool(before.recent and t - before.recent[0].t > options.looks_kept) :]
+    kept = before.recent[bool(before.recent and t - before.recent[0].t > options.scatter_memory) :]
     trend = before.capacity if curve is before.curve else _capacity_along(curve, kept, options)
     earlier, once, twice = _looks_from(
         kept, (t - options.scatter_lag, t - options.swing_time, t - 2.0 * options.swing_time), options.scatter_lag
@@ -321,7 +321,7 @@ def watched(
     total = pull + reserve
     share, rise = (min(look.asked, pull) / total, rising.slope / total) if total > 0.0 else (0.0, 0.0)
     time_left = None
-    if t - before.since >= options.settling_time:
+    if t - before.since >= options.long_memory:
         time_left = 0.0
         if reserve > 0.0:
             time_left = _time_of_creep(creeping, float(curve.slip[-1]), giving.slope / total, options)

@@ -22,17 +22,15 @@ class WatchOptions:
     3 Hz.  With 0.12 s one bogging less was warned of in time on two of three machines (122 boggings, seed 71)."""
     slip_exponent: float = 7.5
     """b [1]: gross traction ratio mu = mu_max (1 - e^(-b s)) over slip s (Brixius 1987, tyres in fields)."""
-    looks_kept: float = 10.0
-    """Age [s] up to which moments are kept for the next curve."""
-    settling_time: float = 2.0
-    """Age [s] of a trend from which it is used."""
 
     long_memory: float = 2.5
-    """Time constant [s] of forgetting a capacity: of ground that softens over many metres."""
+    """Time constant [s] of forgetting a capacity: of ground that softens over many metres.  Younger trends warn of
+    nothing."""
     short_memory: float = 0.8
     """Time constant [s] of forgetting a capacity: of a soft patch's edge."""
     scatter_memory: float = 10.0
-    """Time constant [s] of forgetting how much a capacity scatters and a demand swings."""
+    """Time constant [s] of forgetting how much a capacity scatters and a demand swings; moments are kept as long for
+    the next curve."""
     scatter_lag: float = 0.5
     """Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground."""
     demand_memory: float = 4.0

@@ -34,7 +34,7 @@ from soilbus.diagnosis.score import (
 )
 from soilbus.diagnosis.search import excess_without_effects, required_fall_beside, temperature_beside
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.posterior import NORMAL_95, SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
 
 
@@ -100,7 +100,7 @@ def _detectable(
     options: DiagnosisOptions,
 ) -> Detectable:
     parameter = effect.parameters[0]
-    most = _max_size(parameter, options)
+    most = _max_size(parameter)
     block = np.ix_(columns, columns)
     if effect.of_record:  # in one recording, while the others pay for parameters that they do not need
         informations = [data_ratio * one.information[block] for one in equations]
@@ -124,10 +124,10 @@ def _sampling_delay(effect: Effect, record: Record) -> float:
     return max((record.training.sample_time(quantity) / 2.0 for quantity in [*effect.late][:1]), default=0.0)
 
 
-def _max_size(parameter: Parameter, options: DiagnosisOptions) -> float:
-    """The largest plausible size."""
+def _max_size(parameter: Parameter) -> float:
+    """The largest plausible size: the end of its prior's 95 % interval."""
     widest = max(parameter.high - parameter.neutral, parameter.neutral - parameter.low)
-    return min(options.plausible_sd * parameter.std, widest)
+    return min(NORMAL_95 * parameter.std, widest)
 
 
 def _least_size(information: Array, index: int, free: Sequence[Free], required: float, largest: float) -> float:

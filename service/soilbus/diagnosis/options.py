@@ -38,9 +38,6 @@ class DiagnosisOptions:
     """Descent of fits that are compared by their objective: 0.02 of -2 log decides nothing."""
     negligible_fall: float = 1.0
     """Fall of -2 log posterior or evidence up to which two models are equally good: odds of e^0.5."""
-    plausible_sd: float = 2.0
-    """How far from neutral an effect's parameter is plausible, and a start of it is [prior sd]: a normal variable is
-    farther in one case of twenty."""
     check_rounds: int = 3
     """Linearisations that bring the latents of held-out blocks to their optimum; no evidence recorded."""
 

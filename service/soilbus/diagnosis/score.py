@@ -31,7 +31,7 @@ from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Start
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import Latents
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.effects.effect import Effect
 
@@ -56,7 +56,7 @@ class NormalEquations:
 
     gradient (P,) and information (P, P) are of the data alone, without the parameters' prior.  response (C, P) is
     H_cc^-1 H_cu: the present coordinates follow a step u by -response u.  fitted is the present model.
-    is_own (C,): which present coordinates belong to this recording alone.  plausible_sd: see DiagnosisOptions.
+    is_own (C,): which present coordinates belong to this recording alone.
     """
 
     objective: Objective
@@ -68,7 +68,6 @@ class NormalEquations:
     response: Array
     held_out_latents: Latents
     fitted: FittedModel
-    plausible_sd: float
 
     @property
     def shared_gains(self) -> NDArray[np.intp]:
@@ -294,7 +293,6 @@ def _reduced(
         response,
         held_out,
         present,
-        record.options.plausible_sd,
     )
 
 
@@ -360,11 +358,11 @@ def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) 
 def _start(
     equations: NormalEquations, columns: NDArray[np.intp], step: Array, offset: Array | float, by_u: Array
 ) -> Start:
-    """Where a fit of one recording with the effect begins: at the step (P,), shortened to `plausible_sd`.
+    """Where a fit of one recording with the effect begins: at the step (P,), shortened to the prior's 95 % interval.
 
     offset (C,) and by_u (C, P): what the present coordinates change by, and by each of all parameters.
     """
-    share = min(1.0, equations.plausible_sd / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    share = min(1.0, NORMAL_95 / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     step = share * step
     follow = offset + by_u[:, columns] @ step
     objective, iterate = equations.objective, equations.iterate

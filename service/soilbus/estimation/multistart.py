@@ -31,8 +31,8 @@ from soilbus.estimation.observation_model import (
     ObservationModel,
     Optimum,
 )
-from soilbus.estimation.options import SearchOptions, SolverOptions
-from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
+from soilbus.estimation.options import SolverOptions
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import CONVERGED, Iterate, Objective, QuadraticModel, Solution, Termination, minimise
 from soilbus.terra.soils import KINDS, SOILS
@@ -342,19 +342,16 @@ def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gau
 
     See `soil_classes.ranked_by_likelihood`.
     """
-    options = problem.options.search
     yield Soil(*(prior.median if joint_prior is None else joint_prior.soil).tolist())
-    likeliest, second, *_ = ranked_by_likelihood(
-        problem, [clip_to_prior(prior, SOILS[kind], options) for kind in KINDS]
-    )
+    likeliest, second, *_ = ranked_by_likelihood(problem, [clip_to_prior(prior, SOILS[kind]) for kind in KINDS])
     yield likeliest
-    yield clip_to_prior(prior, SOILS["loam"], options)
+    yield clip_to_prior(prior, SOILS["loam"])
     yield second
 
 
-def clip_to_prior(prior: SoilPrior, soil: Soil, options: SearchOptions) -> Soil:
-    """The soil with held parameters at their values and the others within `start_prior_sd` of the prior's median."""
-    factor = np.exp(options.start_prior_sd * prior.log_std)
+def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
+    """The soil with held parameters at their values and the others within the prior's 95 % interval."""
+    factor = np.exp(NORMAL_95 * prior.log_std)
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
 
@@ -406,7 +403,7 @@ def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: S
 
     The candidate is an end of the search other than the first, from which `found` was reached, or the soil
     with k_c's other share.  There is no second mode where its share of the probability is below `min_mode_share`
-    or the two are less than `distinct_sd` apart.
+    or the one lies in the 95 % interval of the other.
     """
     options = objective.options
     has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
@@ -418,7 +415,7 @@ def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: S
         return found
     better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
     share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.neg2_log_evidence - better.neg2_log_evidence), 50.0)))
-    is_distinct = better.mode.posterior.distance(worse.mode.posterior.soil) >= options.distinct_sd
+    is_distinct = better.mode.posterior.distance(worse.mode.posterior.soil) >= NORMAL_95
     if share < options.min_mode_share or not is_distinct:
         return better
     return replace(better, second_mode=SecondMode(worse.mode, share), is_gaussian=False)

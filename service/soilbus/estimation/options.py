@@ -98,8 +98,6 @@ class SearchOptions:
 
     thinned: int = 24
     """Instants of a window that the search for starts uses; no evidence recorded."""
-    start_prior_sd: float = 2.0
-    """How far a start may be from the prior's median [prior sd]; with 4, the bounds, border windows end elsewhere."""
     plausible_chi2: float = 3.0
     """Objective per residual [1] up to which an optimum of the search may be the soil's; no evidence recorded."""
     implausible: float = 60.0
@@ -114,9 +112,6 @@ class SearchOptions:
     other_optimum_sd: float = 10.0
     """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
     are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""
-    distinct_sd: float = 2.0
-    """Mahalanobis distance [sd] of two optima from which they are two modes, and difference of their bearing pressure
-    or tan phi [sd] from which a window is ambiguous; no evidence recorded."""
     min_mode_share: float = 0.05
     """Share of the probability [1] below which a second mode does not count; no evidence recorded."""
     typical_depth: float = 0.03
@@ -215,9 +210,7 @@ class TrackerOptions:
     extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
     """Shares [1] of a new soil's data that are tried as part of its transition."""
     transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
-    """Lengths of a transition that are tried [wheelbases]: borders are sharp or gradual."""
-    default_wheelbase: float = 2.0
-    """Length [m] that stands for the wheelbase of a rig that has none."""
+    """Lengths of a transition that are tried [wheelbases; of a rig wheel diameters]: borders are sharp or gradual."""
     gain_memory: float = 60.0
     """Windows [1] in which the variance of a sensor gain may grow by its whole prior variance."""
     gain_correlation_time: float = 86400.0

@@ -541,8 +541,8 @@ class Tracker:
 
     def _candidate_transitions(self, change: ChangePoint, start: float) -> list[Transition]:
         """Transitions of growing length from the change point on; of those over before `start` [s] only the last."""
-        chassis = self.rig.chassis
-        lag = (self.options.default_wheelbase if chassis is None else chassis.wheelbase) / change.speed
+        chassis, wheel = self.rig.chassis, 2.0 * float(self.rig.radius.max())
+        lag = (wheel if chassis is None else chassis.wheelbase) / change.speed
         ends = [change.t + length * lag for length in self.options.transition_lengths]
         n_over = sum(end <= start for end in ends)
         return [Transition(change.t - TIME_TOLERANCE, end, lag) for end in ends[max(n_over - 1, 0) :]]

@@ -40,7 +40,7 @@ from soilbus.estimation.assembly import effects_and_parameters_of, form_of, mode
 from soilbus.estimation.measurements import MASS_GAIN, gains_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
-from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.posterior import NORMAL_95, Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
@@ -386,13 +386,12 @@ class WindowEstimator:
         return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
 
     def _ambiguous(self, fit: Fit) -> bool:
-        """Whether a second mode has a bearing pressure or tan phi more than `distinct_sd` from the first."""
+        """Whether a second mode has a bearing pressure or tan phi outside the first one's 95 % interval."""
         if fit.second_mode is None:
             return False
         one, other = fit.mode.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
-        distinct_sd = self.rig.options.search.distinct_sd
-        return any(abs(a.value - b.value) > distinct_sd * a.std for a, b in pairs)
+        return any(abs(a.value - b.value) > NORMAL_95 * a.std for a, b in pairs)
 
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:

@@ -336,7 +336,7 @@ def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
     """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
     options = data.options
     window = data.window
-    lag = max(round(options.change_time / data.bin), 1)
+    lag = max(round(options.contradiction_time / data.bin), 1)
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
@@ -394,7 +394,7 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
     """
     options = data.options
     window = data.window
-    lag, n = max(round(options.change_time / data.bin), 1), max(round(options.scale_time / data.bin), 1)
+    lag, n = max(round(options.contradiction_time / data.bin), 1), max(round(options.scale_time / data.bin), 1)
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
     if len(reported) < n:
@@ -470,7 +470,11 @@ def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None:
         return
-    lag, weight, variance = max(round(options.change_time / data.bin), 1), chassis.mass * GRAVITY, window.variance
+    lag, weight, variance = (
+        max(round(options.contradiction_time / data.bin), 1),
+        chassis.mass * GRAVITY,
+        window.variance,
+    )
     driven = change((window.torque / rig.radius).sum(axis=1), lag)
     noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
     known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
@@ -496,7 +500,7 @@ def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], noise: tuple
         return False
     opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
     often = opposite >= options.opposite_share * n
-    closely = of_both < options.opposite_correlation * np.sqrt(of_one * of_other)
+    closely = of_both < -options.possible_correlation * np.sqrt(of_one * of_other)
     return bool((often & closely).any())
 
 

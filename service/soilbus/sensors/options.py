@@ -54,7 +54,7 @@ class ConsistencyOptions:
     """
 
     contradiction_time: float = 1.0
-    """Time [s] for which a contradiction must last; no evidence recorded."""
+    """Time [s] for which a contradiction must last, and over which changes are compared; no evidence recorded."""
     significant_sd: float = 5.0
     """Standard deviations [1] by which a change must stand out of the noise, and the probability below which noise
     leaves equal readings; no evidence recorded."""
@@ -83,12 +83,8 @@ class ConsistencyOptions:
     """Wrong share [1] of the weight that nothing carried explains, so that all load cells are wrong; no evidence
     recorded."""
 
-    change_time: float = 1.0
-    """Time [s] over which changes are compared; no evidence recorded."""
     opposite_share: float = 0.85
     """Share [1] of significant changes that go the wrong way; no evidence recorded."""
-    opposite_correlation: float = -0.9
-    """Their correlation [1], at most; no evidence recorded."""
     opposite_time: float = 4.0
     """Time [s] of significant changes, one after the other: at the border of a soft soil a driver who lifts the
     implement may pull less and drive more for a moment."""
@@ -100,7 +96,8 @@ class ConsistencyOptions:
     sure_correlation: float = 0.985
     """Correlation [1] of the two at the best delay, at least; no evidence recorded."""
     possible_correlation: float = 0.9
-    """Correlation [1] at another delay from which that delay is possible too; no evidence recorded."""
+    """Correlation [1] at another delay from which that delay is possible too; minus it at most, changes are opposite;
+    no evidence recorded."""
     known_share: float = 0.9
     """Share [1] of bins with both; no evidence recorded."""
     scale_ratio: float = 1.35
