@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from soilbus.decision.demand import present_demand
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.posterior import Estimate
+from soilbus.estimation.window import steady
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.terra.vehicle import GRAVITY
@@ -70,6 +72,22 @@ def test_an_unknown_slope_counts_as_level_and_an_unknown_draft_as_no_demand():
     gone = dataclasses.replace(window, draft=np.where(window.t > 8.9, np.nan, window.draft))
     assert present_demand(gone, RIG.chassis, 1.0) is None
     assert present_demand(window, None, 1.0) is None
+
+
+@pytest.mark.parametrize(
+    "has_sample",
+    [T % 0.5 < 0.12, (T % 0.5 < 0.12) & (T < 8.0), np.random.default_rng(3).random(len(T)) < 0.1],
+    ids=["gaps", "silent for the last 2 s", "one in ten"],
+)
+def test_a_slope_does_not_end_where_its_sensor_has_no_sample(has_sample):
+    slope = np.full(len(T), 0.12)
+    store = Bins(RIG, 0.04, 0.0)
+    store.add({"draft": (T, np.full(len(T), 2000.0)), "pitch": (T[has_sample], slope[has_sample])})
+    demand = present_demand(steady(store.window(0.0, 10.0)), RIG.chassis, 1.0)
+    assert demand.pull == pytest.approx(2000.0 + WEIGHT * np.sin(0.12), rel=1e-6)
+    assert demand.sine == pytest.approx(np.sin(0.12), rel=1e-6)
+    backward = replace(store.window(0.0, 10.0), direction=np.full(250, -1.0))
+    assert present_demand(steady(backward), RIG.chassis, 1.0).pull == pytest.approx(demand.pull)
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.2, -0.2])

@@ -80,6 +80,7 @@ def window(reason: str, status: Status = Status.INVALID, **more) -> WindowResult
         ("standstill", "drive"),
         ("turning", "drive straight"),
         ("no_convergence", "check signs and scales"),
+        ("not_excited few_bins", "estimator.bin"),
         ("model_mismatch", "5 times the noise off"),
         ("internal_error", None),
     ],

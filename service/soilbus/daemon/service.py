@@ -37,6 +37,7 @@ from soilbus.decision.immobilisation import Alert, Watch, ended, has_cause, watc
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
+from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.intake import Latest
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.pipeline import Pipeline
@@ -392,14 +393,15 @@ class Service:
         ended = self._work_queue.oldest_end
         if ended is not None and now - ended > self.config.traversability.max_age:
             return ServiceState.DEGRADED, f"overload a window is not solved {now - ended:.1f} s after its end"
-        if self.result is None or self._reached <= self._interrupted:
+        result = self._last
+        if result is None:
             return ServiceState.ESTIMATING, "none"
-        reason = self.result.reason
-        if self.result.gaps and reason.split()[0] in ("none", "model_mismatch"):
-            reason = "model_gap " + " ".join(self.result.gaps)
+        reason = result.reason
+        if result.gaps and reason.split()[0] in ("none", "model_mismatch"):
+            reason = "model_gap " + " ".join(result.gaps)
         if reason == "none" and self.bus.state is BusState.PASSIVE:
             reason = f"bus_error {self.bus.state}"
-        return state_after(self.result), reason
+        return state_after(result), reason
 
     def _why_stale(self, stale: list[str], read: float) -> str:
         """Reason for channels that are stale at the bus time `read`: silent from the start, silent now, or refused."""
@@ -410,6 +412,11 @@ class Service:
         if silent:
             return "input_stale " + " ".join(silent)
         return "input_rejected " + " ".join(f"{name} ({refused[name]})" for name in stale)
+
+    @property
+    def _last(self) -> WindowResult | None:
+        """The last window's result; None until a window has data from after the last interruption."""
+        return None if self._reached <= self._interrupted else self.result
 
     def present_decision(self, now: float) -> Traversability:
         """The present decision.
@@ -426,7 +433,7 @@ class Service:
         """
         if self._interruption(now) is not None:
             return Traversability()
-        result = None if self._reached <= self._interrupted else self.result
+        result = self._last
         decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
         return at_present(decision, basis, self._loss, self._present_time(now), self.config, self._warned)
 
@@ -453,7 +460,8 @@ class Service:
         return self.result.traversability.since_valid + max(self._present_time(now) - self.result.t, 0.0)
 
     def _publish_ten_hertz(self, now: float) -> None:
-        latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
+        corrections = Corrections() if self._last is None else self._last.corrections
+        latest = self.intake.latest(self._time.at(now), corrections) if self.bus.is_open else Latest({}, None)
         if latest.motion is not None:
             self._loss = observed(self._loss, latest.motion, self.config)
         rig = self.intake.rig

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.window import Rig, Window, zero_if_unknown
+from soilbus.estimation.window import Rig, Window, steady, zero_if_unknown
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 
 __all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "with_speeds"]
@@ -280,7 +280,7 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
         slope = rig.options.measurements.unknown_slope
         variance["draft"] = np.where(_shows_slope(window, rig), 0.0, (slope * weight) ** 2)
     if rig.specific_force and not window.kinematic:
-        changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(window.pitch))
+        changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(steady(window).pitch))
     if rig.chassis is not None and np.isfinite(window.steering_angle).any() and not np.isfinite(window.yaw_rate).any():
         curvature = np.tan(window.steering_angle) / rig.chassis.wheelbase
         changed["yaw_rate"] = window.ground_speed * curvature
@@ -307,7 +307,7 @@ def _combined(values: Array, weight: Array) -> Array:
 
 def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array, Array, Array]:
     """Loads of the wheels; observations of them, their variances, and what they follow as in `Observations` (N, W)."""
-    n, W = len(window.t), len(given.load)
+    n, W, window = len(window.t), len(given.load), steady(window)
     load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
     chassis = rig.chassis
     for i, row in enumerate(given.load):

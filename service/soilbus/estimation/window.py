@@ -418,8 +418,24 @@ def zero_if_unknown(values: Array) -> Array:
     return np.where(np.isnan(values), 0.0, values)
 
 
+def steady(window: Window) -> Window:
+    """The window with pitch, roll and acceleration on lines between the bins that have them, constant outside.
+
+    For what is to be known in every bin: loads, demand, warning.  A slope does not end where its sensor has no sample.
+    """
+    changed: dict[str, Any] = {}
+    variance, direction = dict(window.variance), window.direction if len(window.direction) else np.ones(len(window.t))
+    for name, sign in (("pitch", direction), ("acceleration", direction), ("roll", np.ones(len(window.t)))):
+        known = np.isfinite(values := getattr(window, name))
+        if known.any() and not known.all():
+            t = window.t, window.t[known]
+            changed[name] = sign * np.interp(*t, (sign * values)[known])
+            variance[name] = np.interp(*t, variance[name][known])
+    return replace(window, variance=variance, **changed) if changed else window
+
+
 def pull_asked(window: Window, chassis: Chassis) -> Array:
-    """Pull [N] (N,) that draft and slope ask of the wheels; nan without draft, level where pitch is unknown."""
+    """Pull [N] (N,) that draft and slope ask of the wheels; nan without draft, level where no pitch is known."""
     return np.asarray(pull_required(chassis, window.draft, zero_if_unknown(window.pitch), 0.0))
 
 

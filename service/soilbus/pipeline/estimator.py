@@ -42,13 +42,14 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import NORMAL_95, Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput, TrackerState
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput, TrackerState
+from soilbus.estimation.window import Rig, Window, steady
+from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.determination import excitation_of, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import GapWatch, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
-from soilbus.terra.effects.effect import Active, Surroundings, true_draft
+from soilbus.terra.effects.effect import Active
 from soilbus.terra.effects.steady import CompletedModel
 
 
@@ -187,11 +188,12 @@ class WindowEstimator:
         )
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
-        window = _with_true_draft(task.window, effects, self.rig)
-        rig = self._with_estimated_mass(tracked)
+        window = Corrections(effects=effects).corrected(steady(task.window), self.rig)
+        rig = self._as_driven(tracked, window)
         demand = present_demand(window, rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
-        limit = self._torque_limit(task, window)
+        corrections = Corrections(self._torque_ceiling(task, window), effects)
+        result, limit = replace(result, corrections=corrections), corrections.torque_limit(task.torque_limit)
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
@@ -231,11 +233,8 @@ class WindowEstimator:
             decision, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
 
-    def _torque_limit(self, task: WindowTask, window: Window) -> NDArray[np.float64]:
-        """Greatest available torque (W,) [N m]: 0 of an idle wheel, at most a torque ceiling that was measured.
-
-        window: the task's, with the true draft.
-        """
+    def _torque_ceiling(self, task: WindowTask, window: Window) -> tuple[float, ...]:
+        """Corrections.torque_ceiling; window: the task's, with its draft corrected."""
         hop, deviations = self._settings.hop, self.config.traversability.contradiction
         if task.fresh:
             self._idle, self._ceiling = (
@@ -244,7 +243,8 @@ class WindowEstimator:
             )
         self._idle = idle(task.window, self.rig, task.end - hop, self._idle)
         self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
-        return np.where(self._idle, 0.0, np.fmin(task.torque_limit, self._ceiling.limit))
+        measured = np.where(np.isfinite(self._ceiling.limit), self._ceiling.limit, np.inf)
+        return tuple(np.where(self._idle, 0.0, measured).tolist())
 
     def _model_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
         """The channels that have not fitted for minutes; windows with missing or poor inputs do not count."""
@@ -290,6 +290,13 @@ class WindowEstimator:
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
         """Gain error of the draft sensor: posterior of the fit, else the prior."""
         return self._gain(tracked, "draft")
+
+    def _as_driven(self, tracked: TrackerOutput, window: Window) -> Rig:
+        """The rig with its estimated mass, and where the window ends in reverse with its chassis so."""
+        rig = self._with_estimated_mass(tracked)
+        if rig.chassis is None or not (window.direction[-1:] < 0.0).any():
+            return rig
+        return replace(rig, chassis=rig.chassis.in_reverse)
 
     def _with_estimated_mass(self, tracked: TrackerOutput) -> Rig:
         """The rig with the mass m / (1 + gain of the weight) that the window estimates, where no load cell does."""
@@ -348,7 +355,10 @@ class WindowEstimator:
         if fit is None and not tracked.mismatch:
             if tracked.standstill + tracked.turning > 0:
                 return Status.NOT_EXCITED, _gated(tracked)
-            return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
+            if task.poor:
+                return Status.INVALID, "input_stale " + " ".join(task.poor)
+            is_short = tracked.reason is Reason.TOO_FEW_DATA
+            return (Status.NOT_EXCITED, "not_excited few_bins") if is_short else (Status.INVALID, "no_convergence")
         failure = self._failure(tracked)
         if fit is None or failure is not None:
             status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
@@ -409,27 +419,3 @@ def _gated(tracked: TrackerOutput) -> str:
 def _widening(tracked: TrackerOutput, fit: Fit) -> float:
     """Factor of a fit's covariance: its reduced chi-square where the window does not fit, else 1."""
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
-
-
-def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:
-    """The window with its draft corrected by the effects of the draft sensor."""
-    if not any(active.effect.draft for active in effects) or not len(window.t):
-        return window
-    return replace(window, draft=true_draft(effects, window.draft, _surroundings(window, rig)))
-
-
-def _surroundings(window: Window, rig: Rig) -> Surroundings:
-    """The measured quantities on which effects may depend."""
-    t = (window.t - window.t[0])[:, None]
-    return Surroundings(
-        t=t,
-        distance=np.zeros_like(t),
-        load=window.load,
-        ground_speed=window.ground_speed[:, None],
-        wheel_speed=window.speed,
-        rear=~rig.front,
-        draft=window.draft[:, None],
-        acceleration=window.acceleration[:, None],
-        mass=0.0 if rig.chassis is None else rig.chassis.mass,
-        duration=float(t[-1, 0]),
-    )

@@ -29,7 +29,16 @@ from soilbus.decision.options import WATCH
 from soilbus.decision.traction_loss import Motion, motion_of
 from soilbus.estimation.assembly import Motor, Motors, delays_of, motors_of, rig_of
 from soilbus.estimation.instrumentation import completed
-from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
+from soilbus.estimation.window import (
+    VEHICLE_QUANTITIES,
+    WHEEL_QUANTITIES,
+    Window,
+    forward,
+    inertia_of,
+    pull_given,
+    steady,
+)
+from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import SensorConsistency, without
@@ -408,20 +417,26 @@ class Intake:
             if c.name in self._last_refused and now - self._last_refused[c.name][0] <= self._timeout(c)
         }
 
-    def latest(self, now: float) -> Latest:
-        """Slip, pull, motion, draft and pitch over the last `moment_span` before `now` [s]."""
+    def latest(self, now: float, corrections: Corrections = Corrections()) -> Latest:  # noqa: B008, immutable
+        """Slip, pull, motion, draft and pitch over the last `moment_span` before `now` [s].
+
+        corrections: of the last window.  Pitch and acceleration may be as old as the time-out of a channel.
+        """
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        raw = without(self._bins.glimpse(last - WATCH.moment_span, last), self.rig, set(self._implausible))
-        window = completed(forward(raw), self.rig)
+        raw = without(self._bins.glimpse(last - self._options.timeout, last), self.rig, set(self._implausible))
+        measured, start = completed(forward(raw), self.rig), last - WATCH.moment_span
+        recent = np.flatnonzero(measured.t > start)
+        window, measured = corrections.corrected(steady(measured), self.rig).rows(recent), measured.rows(recent)
         if self.rig.chassis is None:
             return Latest(self._slip(window), None)
         pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
         given = column_means(pull[:, None])[0]
-        motion = motion_of(window, self.rig, self._limits.at(now), self._decision)
+        limit = corrections.torque_limit(self._limits.at(now))
+        motion = motion_of(window, self.rig, limit, self._decision)
         part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
-        draft, pitch = column_means(np.column_stack((window.draft, window.pitch)))
+        draft, pitch = column_means(np.column_stack((measured.draft, measured.pitch)))
         return Latest(self._slip(window), given, part, motion, draft, pitch)
 
     def _slip(self, window: Window) -> dict[str, float | None]:

@@ -15,6 +15,7 @@ from soilbus.decision.immobilisation import Warnings, Watch
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import Status, Traversability
+from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.determination import Excitation
 from soilbus.pipeline.positions import Position
 
@@ -92,6 +93,8 @@ class WindowResult:
         The data that the decision rests on.
     shows_strength
         Whether tan phi is known to `estimator.max_tan_phi_std`.
+    corrections
+        Of what is read after the window.
     """
 
     t: float
@@ -122,6 +125,7 @@ class WindowResult:
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
     shows_strength: bool = False
+    corrections: Corrections = Corrections()  # noqa: RUF009, immutable
 
     @property
     def curve(self) -> OverSlip | None:

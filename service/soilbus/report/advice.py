@@ -36,6 +36,8 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
     match kind:
         case "not_excited" if names == ["new_soil"]:
             return "the ground had just changed: nothing to do but drive on"
+        case "not_excited" if names == ["few_bins"]:
+            return "a window holds too few values for a soil: set a shorter estimator.bin or a longer estimator.window"
         case "not_excited" | "ambiguous":
             return _vary(windows, valid)
         case "standstill":

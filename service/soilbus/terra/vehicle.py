@@ -6,7 +6,7 @@ it holds the vehicle back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,11 @@ class Chassis:
     cg_height: float
     hitch_height: float
     on_tracks: bool = False
+
+    @property
+    def in_reverse(self) -> Chassis:
+        """For forces and slopes as a drive forward has them (`window.forward`): backward they act the other way."""
+        return replace(self, cg_height=-self.cg_height, hitch_height=-self.hitch_height)
 
 
 def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
