@@ -50,13 +50,14 @@ class MeasurementOptions:
     """Largest skid (minus slip) [1] of a wheel without torque that is tried on the way to T = 0: ten times what field
     soils take, so that none of them is cut off."""
     slip_sd: float = 0.1
-    """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is
-    measured; no evidence recorded."""
+    """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is measured.
+    With 0.07 and 0.13 a pressure moves by 0.9 and 0.1 sd at most."""
     shaft_sd: float = 1e-3
-    """Relative sd [1] of speeds that a shaft makes equal: backlash and twist; no evidence recorded."""
+    """Relative sd [1] of speeds that a shaft makes equal: backlash and twist.  30 % either way moves no simulated
+    window."""
     min_torque_share: float = 0.05
-    """Torque over load and radius [1] that a differential's friction counts at least, and that of a coasting vehicle;
-    no evidence recorded."""
+    """Torque over load and radius [1] that a differential's friction counts at least, and that of a coasting vehicle.
+    30 % either way moves no simulated window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +85,10 @@ class SolverOptions:
     max_rejected: int = 6
     """Rejected steps in a row."""
     slow_ratio: float = 0.5
-    """Length of a step over that of the last, along it [1], above which steps are extrapolated; no evidence
-    recorded."""
+    """Length of a step over that of the last, along it [1], above which steps are extrapolated.  With 0.25 and 0.75 no
+    status of the golden replays moves."""
     max_extrapolation: float = 8.0
-    """Largest multiple [1] of a full step by extrapolation; no evidence recorded."""
+    """Largest multiple [1] of a full step by extrapolation.  With 3 and 20 no status of the golden replays moves."""
     give_up_above: float = math.inf
     """Value of the objective above which the fit is of no use: set by the caller."""
 
@@ -97,9 +98,10 @@ class SearchOptions:
     """Starts of a window's fit, steps of the soil, bounds, and a second mode."""
 
     thinned: int = 24
-    """Instants of a window that the search for starts uses; no evidence recorded."""
+    """Instants of a window that the search for starts uses.  With 12 and 48 no status of the golden replays moves."""
     plausible_chi2: float = 3.0
-    """Objective per residual [1] up to which an optimum of the search may be the soil's; no evidence recorded."""
+    """Objective per residual [1] up to which an optimum of the search may be the soil's.  With 1.5 no status of the
+    golden replays moves, with 6 a window across a border gets an estimate."""
     implausible: float = 60.0
     """Objective per thinned instant [-2 log] above which a window cannot be of one soil.  Without this limit the
     budget of a border's search is gone before another soil is found."""
@@ -107,22 +109,26 @@ class SearchOptions:
     """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
     `replay-bogging` gets an estimate."""
     determined_k_c_sd: float = 0.6
-    """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it; no
-    evidence recorded."""
+    """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it.  With 0.3
+    no status of the golden replays moves, with 1.2 no value."""
     other_optimum_sd: float = 10.0
     """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
     are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""
     min_mode_share: float = 0.05
-    """Share of the probability [1] below which a second mode does not count; no evidence recorded."""
+    """Share of the probability [1] below which a second mode does not count.  With 0.02 and 0.15 no golden value moves.
+    """
     typical_depth: float = 0.03
-    """Sinkage [m] at which the bearing pressure is a coordinate; no evidence recorded."""
+    """Sinkage [m] at which the bearing pressure is a coordinate.  With 0.015 and 0.06 no status of the golden replays
+    moves."""
     max_log_step: float = 0.7
-    """Longest step of a coordinate [1, a logarithm]: a factor of two; no evidence recorded."""
+    """Longest step of a coordinate [1, a logarithm]: a factor of two.  With 0.35 no status of the golden replays moves,
+    with 1.4 a window across a border gets an estimate."""
     bound_sd: float = 4.0
-    """Bound of a free parameter's logarithm about the prior median [prior sd]; no evidence recorded."""
+    """Bound of a free parameter's logarithm about the prior median [prior sd].  With 3 clay lies at a bound (306 states
+    of `replay-clay` are worse), with 6 no status moves."""
     max_angle_change: float = 0.2
-    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated; no
-    evidence recorded."""
+    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.  With 0.1
+    and 0.4 no status of the golden replays moves."""
     max_angle_change_with_effects: float = 0.1
     """The same [1] where effects have a part in the load: they may be curved where the soil alone is not."""
     soil_alone: SolverOptions = SolverOptions(
@@ -145,12 +151,14 @@ class PosteriorOptions:
     """What a fit's posterior is: moments, average along n, drift, path curvature, form, soil classes."""
 
     determined_n_sd: float = 0.05
-    """Sd of log n [1] below which a posterior with one mode counts as Gaussian; no evidence recorded."""
+    """Sd of log n [1] below which a posterior with one mode counts as Gaussian.  With 0.025 ten states of the golden
+    replays move, with 0.1 none."""
     min_load_signal: float = 4.0
     """Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1
     all of it is noise, at 4 a quarter is."""
     first_node_step: float = 0.1
-    """Longest first step of log n [1] from the mode; no evidence recorded."""
+    """Longest first step of log n [1] from the mode.  With 0.05 and 0.2 no status of the golden replays moves, and 30
+    values at most."""
     node_step_growth: float = 1.7
     """Ratio [1] of each step of log n to the one before: 10 nodes in place of 12 with 1.4, the same errors and coverage
     at constant loads (`posterior_forms --seed 178`); longer first steps are not as good there."""
@@ -170,11 +178,12 @@ class PosteriorOptions:
     within `bound_sd` prior sd (of 0.83, std = value) is uniform, with 4^2 0.83^2 / 3 = 3.7.  At its bound a parameter
     that is linear in the fit may have any variance of its logarithm: without this k_phi had an std of 1e155 on snow."""
     drift_pieces: int = 5
-    """Pieces of a window, each with its own soil; no evidence recorded."""
+    """Pieces of a window, each with its own soil.  With 3 and 8 three and six states of the golden replays move."""
     steady_drift_sd: float = 7.0
-    """Prior sd of a steady change of the soil in one window, in units of `drift` [1]; no evidence recorded."""
+    """Prior sd of a steady change of the soil in one window, in units of `drift` [1].  With 3 and 20 no status of the
+    golden replays moves."""
     knot_spacing: float = 1.0
-    """Time [s] between two knots of the path's curvature; no evidence recorded."""
+    """Time [s] between two knots of the path's curvature.  With 0.5 and 2 s no status of the golden replays moves."""
     form_stride: int = 4
     """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
     mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
@@ -188,8 +197,8 @@ class TrackerOptions:
     false_alarms_per_hour: float = 1.0
     """Windows an hour [1/h] in which noise alone makes the change detector search for another soil."""
     mismatch_sd: float = 3.5
-    """Sd of reduced chi-square [sd] by which a window may exceed `Settings.max_chi2`; 0 after a mismatch; no evidence
-    recorded."""
+    """Sd of reduced chi-square [sd] by which a window may exceed `Settings.max_chi2`; 0 after a mismatch.  With 2 and 6
+    no golden value moves."""
     settled_sd: float = 1.5
     """The same [sd] just after a border: its remains in the window bias the soil long before they are a mismatch."""
     significance: float = 25.0
@@ -197,7 +206,8 @@ class TrackerOptions:
     a longer transition, beyond the number of residuals left out, and by path curvature at knots; score statistic above
     which sinkages are on a wrong scale: 5 sd of one unknown.  Curvature fits noise by about 9 in a window of 10 s."""
     min_rows_per_soil: int = 30
-    """Residuals that each of two soils needs before they are compared; no evidence recorded."""
+    """Residuals that each of two soils needs before they are compared.  With 10 a border in `replay-bogging` is taken
+    for a soil too early, with 90 two are found late."""
     min_to_detect: float = 0.3
     """Windows [1] that a soil must fill before a change from it is looked for, that lie before the end of the last
     fit's data and are looked at again, and after a change point during which data that no soil explains may be of a

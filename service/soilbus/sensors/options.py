@@ -30,15 +30,19 @@ class ReceptionOptions:
     """Share [1] of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise."""
 
     timeout: float = 1.0
-    """Age [s] from which a channel without a configured time-out is stale; no evidence recorded."""
+    """Age [s] from which a channel without a configured time-out is stale.  0.7 and 1.3 s: one window less and none
+    more has data enough."""
     covered_block: float = 0.5
-    """Time [s] of a block that counts as covered if it has a sample; no evidence recorded."""
+    """Time [s] of a block that counts as covered if it has a sample.  0.35 and 0.65 s: 10 and 3 windows less have data
+    enough."""
     min_coverage: float = 0.95
-    """Share [1] of a window's blocks that a needed channel must cover; no evidence recorded."""
+    """Share [1] of a window's blocks that a needed channel must cover.  With 0.67 27 windows more have data enough,
+    which miss a third of a channel."""
     limit_samples: int = 3
     """Number of reported torque limits whose median is in force: one outlier does not change it."""
     fix_smoothing: float = 1.0
-    """Time [s] before and after, within which fixes are averaged: receivers are noisy; no evidence recorded."""
+    """Time [s] before and after, within which fixes are averaged: receivers are noisy.  0.7 and 1.3 s give the same
+    positions within a metre."""
 
 
 RECEPTION = ReceptionOptions()
@@ -54,23 +58,24 @@ class ConsistencyOptions:
     """
 
     contradiction_time: float = 1.0
-    """Time [s] for which a contradiction must last, and over which changes are compared; no evidence recorded."""
+    """Time [s] for which a contradiction must last, and over which changes are compared.  0.7 and 1.3 s: 1 and 2 of 81
+    faults less are found."""
     significant_sd: float = 5.0
     """Standard deviations [1] by which a change must stand out of the noise, and the probability below which noise
-    leaves equal readings; no evidence recorded."""
+    leaves equal readings.  30 % either way finds the same faults."""
     repeated_share: float = 0.1
-    """Share [1] of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen;
-    no evidence recorded."""
+    """Share [1] of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen.
+    30 % either way finds the same faults."""
 
     still_share: float = 0.1
-    """Rim speed over ground speed [1] below which a wheel does not turn; no evidence recorded."""
+    """Rim speed over ground speed [1] below which a wheel does not turn.  30 % either way finds the same faults."""
     idle_traction: float = 0.01
     """Traction [1] of a wheel that drives nothing: any soil resists more."""
     driving_traction: float = 0.15
-    """Traction [1] of a wheel that surely drives; no evidence recorded."""
+    """Traction [1] of a wheel that surely drives.  0.105: 1 fault more; 0.195: 1 sound sensor less is named."""
     gear_slack: float = 0.03
-    """Relative difference [1] of motor and wheel speed that gear and radius of the wheel's sensor may have; no evidence
-    recorded."""
+    """Relative difference [1] of motor and wheel speed that gear and radius of the wheel's sensor may have.  30 %
+    either way finds the same faults."""
     feigned_slip: float = 0.12
     """Slip [1] that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
 
@@ -78,32 +83,35 @@ class ConsistencyOptions:
     """Share [1] of the weight by which the loads' sum must be wrong; lost zeros and what is carried stay below it."""
     load_side: float = 0.10
     """Share [1] of an axle's load by which its left and right must differ more than the other axle's for one to be
-    named, and of the weight by which the load of an axle without fault may be wrong; no evidence recorded."""
+    named, and of the weight by which the load of an axle without fault may be wrong.  0.13: 1 fault less is found."""
     any_load: float = 0.6
-    """Wrong share [1] of the weight that nothing carried explains, so that all load cells are wrong; no evidence
-    recorded."""
+    """Wrong share [1] of the weight that nothing carried explains, so that all load cells are wrong.  0.42: 5 sound
+    sensors more are named."""
 
     opposite_share: float = 0.85
-    """Share [1] of significant changes that go the wrong way; no evidence recorded."""
+    """Share [1] of significant changes that go the wrong way.  Nearly 1: 7 faults less are found."""
     opposite_time: float = 4.0
     """Time [s] of significant changes, one after the other: at the border of a soft soil a driver who lifts the
     implement may pull less and drive more for a moment."""
 
     scale_time: float = 3.0
-    """Time [s] over which changes of speed and acceleration are compared; no evidence recorded."""
+    """Time [s] over which changes of speed and acceleration are compared.  2.1 s: 1 sound sensor more is named, 3.9 s:
+    1 fault less is found."""
     min_speed_rms: float = 0.06
-    """Rms [m/s] of the changes of speed that there must be; no evidence recorded."""
+    """Rms [m/s] of the changes of speed that there must be.  0.08: 1 sound sensor less is named."""
     sure_correlation: float = 0.985
-    """Correlation [1] of the two at the best delay, at least; no evidence recorded."""
+    """Correlation [1] of the two at the best delay, at least.  0.69: 4 faults more and 1 sound sensor more; nearly 1:
+    14 faults less."""
     possible_correlation: float = 0.9
-    """Correlation [1] at another delay from which that delay is possible too; minus it at most, changes are opposite;
-    no evidence recorded."""
+    """Correlation [1] at another delay from which that delay is possible too; minus it at most, changes are opposite.
+    0.63: 3 faults less; nearly 1: 88 sound sensors more are named."""
     known_share: float = 0.9
-    """Share [1] of bins with both; no evidence recorded."""
+    """Share [1] of bins with both.  Nearly 1: 14 faults less are found."""
     scale_ratio: float = 1.35
-    """Ratio [1] of their changes from which they contradict each other; no evidence recorded."""
+    """Ratio [1] of their changes from which they contradict each other.  1: 85 sound sensors more are named; 1.76: 14
+    faults less are found."""
     max_delay: float = 0.6
-    """Greatest delay [s] between speed and acceleration; no evidence recorded."""
+    """Greatest delay [s] between speed and acceleration.  30 % either way finds the same faults."""
     jump_explained: float = 0.25
     """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
     fifteen faults of the accelerometer are taken for jumps (`validation.sensitivity`)."""
