@@ -180,7 +180,8 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     -----
     For channels of the vehicle only, whose mass lets them change slowly.  What a wheel does swings with its load at
     1.5 to 3 Hz, so a wheel's bin holds what was measured in it or nothing.  One lost sample doubles the gap, so a gap
-    of more than one and a half times the channel's mean one, rounded up to whole bins, stays empty.
+    of more than one and a half times the channel's usual one (the median of ten gaps in a row, over ten and rounded up
+    to whole bins) stays empty.
     """
     filled = count > 0.0
     n_filled = filled.sum(0)
@@ -191,7 +192,8 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     for channel in slow:
         at = np.flatnonzero(filled[:, channel])
         step = np.diff(at)
-        usual = math.ceil(step.mean())
+        gaps = min(10, len(step))
+        usual = math.ceil(np.median(at[gaps:] - at[:-gaps]) / gaps)
         step = np.where(step <= 1.5 * usual, step, 1)
         between = np.concatenate([np.arange(i + 1, i + n) for i, n in zip(at, step, strict=False)])
         mean[between, channel] = np.interp(centre[between], since[at, channel], mean[at, channel])
