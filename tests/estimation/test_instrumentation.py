@@ -33,6 +33,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil, state_on, wheel_forces
+from soilbus.validation import computed_loads
 
 FIELD = Path(__file__).parents[1] / "field" / "field.toml"
 PLAIN = re.sub(r'\nsinkage = "[^"]*"', "", FIELD.read_text())
@@ -467,3 +468,18 @@ def test_where_nothing_is_towed_the_balance_counts_only_where_a_sensor_shows_the
 def test_check_predicts_the_errors_of_a_machine_that_tows_nothing():
     (line,) = [line for line in load_lines(never_towing()) if "with load cells" in line]
     assert "varied slope" in line
+
+
+def test_a_draft_that_nothing_measures_does_not_bias_a_machine_without_load_cells(monkeypatch):
+    """Rear-driven, nothing but torque, speeds, pitch: 16 windows on sand; tan phi was 1.8 sd too low in the mean."""
+    known = computed_loads.configured("tractor-2wd", "axle cells")
+    bare = known.model_copy(update={
+        "signals": known.signals.model_copy(update={"draft": None}),
+        "axle": [axle.model_copy(update={"load": None}) for axle in known.axle],
+    })  # fmt: skip
+    monkeypatch.setattr(computed_loads, "configured", lambda machine, cells: bare)
+    tasks = [computed_loads.Task("tractor-2wd", "none", "dry_sand", 0.03, seed) for seed in range(16)]
+    off = np.array([one for one in map(computed_loads.errors, tasks) if one is not None])
+    assert len(off) >= 15
+    assert np.all(np.abs(off.mean(axis=0)) < 1.2)
+    assert np.all((np.abs(off) < 1.96).mean(axis=0) > 0.8)

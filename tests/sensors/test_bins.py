@@ -41,7 +41,7 @@ def test_a_channel_a_little_slower_than_the_bins_leaves_none_empty(period):
 
 
 def test_lost_bins_of_a_fast_channel_stay_empty():
-    t, window = stored(0.02, lost=[50, 51, 120, 121])
+    _, window = stored(0.02, lost=[50, 51, 120, 121])
     assert np.isnan(window.ground_speed).sum() == 2
 
 

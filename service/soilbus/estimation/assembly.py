@@ -28,6 +28,7 @@ from soilbus.estimation.instrumentation import (
     contrast,
     rows_of,
     unit,
+    unknown_draft,
 )
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
@@ -203,7 +204,7 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
         for quantity, rows in (
             ("torque", _torque_rows(rig, couplings, ratio)),
             ("speed", _speed_rows(rig, couplings, ratio, groups["speed"])),
-            ("load", _load_rows(rig, vehicle, side)),
+            ("load", _load_rows(rig, vehicle, side, config.measures_draft or vehicle.towing == "never")),
         )
     )
     plain = np.eye(n)
@@ -263,17 +264,27 @@ def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: S
     return [*same, *of_couplings, *(Row(unit(n, i), "free", i, rig.wheels[i]) for i in range(n))]
 
 
-def _load_rows(rig: Rig, vehicle: Vehicle, side: float) -> list[Row]:
-    """Weight, its share on the front axle, and the differences left to right, a share of each axle's load; side: sd."""
+def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> list[Row]:
+    """Weight, its share on the front axle, and the differences left to right, a share of each axle's load; side: sd.
+
+    A draft that nothing measures shifts load in all of a window: it counts with the centre of gravity.
+    """
     n, chassis = len(rig.wheels), rig.chassis
     assert chassis is not None
     mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
     cg_std = UNKNOWN_SHARE * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
     share = chassis.cg_ahead_of_rear_axle / chassis.wheelbase
     transfer = np.where(rig.front, 1.0 - share, -share)
+    shifted = 0.0 if knows_draft else unknown_draft(rig.options.measurements.largest_draft)[1] * chassis.hitch_height
     rows = [
         Row((1.0,) * n, "weight", 0, "weight", mass_std),
-        Row(tuple(transfer.tolist()), "transfer", 0, "balance", cg_std / chassis.cg_ahead_of_rear_axle),
+        Row(
+            tuple(transfer.tolist()),
+            "transfer",
+            0,
+            "balance",
+            math.hypot(cg_std, shifted) / chassis.cg_ahead_of_rear_axle,
+        ),
     ]
     for axle in (rig.front, ~rig.front):
         for one, other in pairwise(np.flatnonzero(axle).tolist()):

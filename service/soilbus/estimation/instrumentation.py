@@ -20,6 +20,7 @@ observations l for the observation model, which propagates their noise through M
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -29,9 +30,9 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window, steady, zero_if_unknown
-from soilbus.terra.vehicle import GRAVITY, axle_loads
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 
-__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "with_speeds"]
+__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "unknown_draft", "with_speeds"]
 
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
@@ -325,7 +326,7 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             load[:, i] = scale[:, i] + _heave(window, rig, given)
         elif row.kind == "transfer":
             along = direction * pitch, direction * zero_if_unknown(window.acceleration)
-            draft, draft_var = _draft_on_hitch(window, rig)
+            draft, draft_var = _draft_on_hitch(window, rig, given, chassis)
             front, rear = axle_loads(chassis, direction * draft, *along)
             share = static / weight
             load[:, i] = (1.0 - share) * front - share * rear
@@ -382,11 +383,20 @@ def _knows_inertia(window: Window, rig: Rig) -> NDArray[np.bool_]:
     return known if rig.specific_force else known & np.isfinite(window.pitch)
 
 
-def _draft_on_hitch(window: Window, rig: Rig) -> tuple[Array, Array]:
-    """Draft [N] for the loads, and its variance: where none is known, any from 0 to half the weight."""
-    known = np.isfinite(window.draft)
-    most = 0.5 * (0.0 if rig.chassis is None else rig.chassis.mass) * GRAVITY
-    return np.where(known, window.draft, most / 2.0), np.where(known, _known_var(window, "draft"), most**2 / 12.0)
+def unknown_draft(most: Any) -> tuple[Any, Any]:
+    """Mean and sd [N] of a draft of which only a bound is known: any from 0 to it is as likely."""
+    return most / 2.0, most / math.sqrt(12.0)
+
+
+def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, chassis: Chassis) -> tuple[Array, Array]:
+    """Draft [N] for the loads, and its variance: where none is measured, at most what the wheels' torques leave it."""
+    known, most = np.isfinite(window.draft), rig.options.measurements.largest_draft * chassis.mass * GRAVITY
+    thrust = (_shares(window, given) / rig.radius).sum(axis=1)
+    along = zero_if_unknown(window.acceleration) + GRAVITY * np.sin(zero_if_unknown(window.pitch))
+    left = np.clip(thrust - chassis.mass * along, 0.0, most)
+    is_measured = np.isfinite(left) & all(row.kind != "unknown" for row in given.torque)
+    mean, std = unknown_draft(np.where(is_measured, left, most))
+    return np.where(known, window.draft, mean), np.where(known, _known_var(window, "draft"), std**2)
 
 
 def _known_var(window: Window, quantity: str) -> Array:
@@ -417,22 +427,29 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
 
 def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> tuple[Array, Array, Array]:
     """Torques of the wheels, observations of them and their variances, each (N, W); nan where a row says nothing."""
-    n, W = len(window.t), len(given.torque)
-    torque, variance = np.zeros((n, W)), np.zeros((n, W))
-    grip = zero_if_unknown(load) * rig.radius
+    torque, shares = _torque_readings(window, given), _shares(window, given)
+    variance, grip = np.zeros_like(torque), zero_if_unknown(load) * rig.radius
     for i, row in enumerate(given.torque):
-        weight = np.array(row.weight)
         if row.kind == "channel":
-            torque[:, i], variance[:, i] = window.torque[:, row.at], window.variance["torque"][:, row.at]
+            variance[:, i] = window.variance["torque"][:, row.at]
         elif row.kind in ("free", "unknown"):
             variance[:, i] = np.nan
-    shares = _solved(given.torque, torque)
-    for i, row in enumerate(given.torque):
-        if row.kind == "coupling":
+        else:
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
             size = np.abs(zero_if_unknown(shares)) @ weight + rig.options.measurements.min_torque_share * grip @ weight
             variance[:, i] = np.where(_may_be_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
     return shares, np.where(np.isfinite(variance), torque, np.nan), variance
+
+
+def _torque_readings(window: Window, given: Instrumentation) -> Array:
+    """What the rows of torques (N, W) read; 0 where no channel does."""
+    zero = np.zeros(len(window.t))
+    return np.stack([window.torque[:, r.at] if r.kind == "channel" else zero for r in given.torque], axis=1)
+
+
+def _shares(window: Window, given: Instrumentation) -> Array:
+    """Torques of the wheels (N, W) where differentials share them equally."""
+    return _solved(given.torque, _torque_readings(window, given))
 
 
 def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:

@@ -43,6 +43,10 @@ class MeasurementOptions:
     side_slope_share: float = 0.06
     """Sd of an axle's mean loads left less right over their sum [1] on side slopes, where no roll is measured: 3
     degrees."""
+    largest_draft: float = 0.5
+    """Largest draft that nothing measures, over the weight [1]: where net traction ratios of tractors in fields end
+    (Wismer & Luth 1974).  It shifts load to the rear in all of a window; counted as independent from bin to bin it left
+    tan phi on dry sand off by 1.8 sd on a rear-driven tractor without load cells."""
     rolling_slip: float = -0.03
     """Slip [1] of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1
     of the load takes a skid of 2 to 5 % on field soils (Wong 2008, fig. 2.60)."""
