@@ -117,6 +117,48 @@ def test_validity_signal(tmp_path: Path, valid: str) -> None:
     assert (found["speed.W"].valid_signal, found["speed.W"].valid_values) == (None, ())
 
 
+def with_states(folder: Path, table: str, **more: Any) -> Any:
+    """The channel of a torque that State vouches for, whose codes have the names of a value table."""
+    (folder / "v.dbc").write_text(f"{DBC}VAL_ 256 State {table} ;\n" if table else DBC, encoding="utf-8")
+    c = config(folder, "v.dbc", torque={"signal": "Motor.Torque", "valid": "State"} | more, speed="Motor.Speed")
+    return channels_of(c, load_databases(c))[0]
+
+
+@pytest.mark.parametrize(
+    ("table", "codes"),
+    [
+        ('0 "Valid" 1 "Invalid" 2 "Init" 3 "SNA"', (0,)),
+        ('0 "No fault" 1 "Fault" 2 "NotOk"', (0,)),
+        ('0 "NOK" 1 "Not ok" 2 "SignalOK" 3 "Normal operation"', (2, 3)),
+        ('0 "Last valid value" 1 "Good"', (1,)),
+        ('0 "No" 1 "Yes" 2 "Error" 3 "Not available"', (1,)),
+        ('0 "off" 1 "ready" 3 "run"', (1,)),
+        ('2 "Error" 3 "Not available"', (1,)),
+        ("", (1,)),
+    ],
+)
+def test_codes_vouch_by_their_names_in_the_value_table(tmp_path: Path, table: str, codes: tuple[int, ...]) -> None:
+    assert with_states(tmp_path, table).valid_values == codes
+
+
+@pytest.mark.parametrize(
+    ("table", "more", "line"),
+    [
+        ('0 "Gut" 1 "Error"', {}, 'State: 1 is "Error" in the DBC\'s value table; give valid_values'),
+        (
+            '0 "Valid" 1 "Invalid"', {"valid_values": [0, 1]},
+            'State: 1 is "Invalid" in the DBC\'s value table; valid_values cannot hold it',
+        ),
+    ],
+)  # fmt: skip
+def test_a_code_that_the_value_table_calls_invalid_cannot_vouch(
+    tmp_path: Path, table: str, more: dict[str, Any], line: str
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        with_states(tmp_path, table, **more)
+    assert error.value.faults == [f"wheel.W.torque: {line}"]
+
+
 @pytest.mark.parametrize(
     ("role", "mapped", "line"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -100,6 +101,24 @@ def test_two_signals_of_a_kind_and_a_percentage_are_questions(capsys):
     text = capsys.readouterr().out
     assert "#   pitch: SlopeSensorInformation.PitchAngle (deg), SlopeSensorInformation2.PitchAngleExtended" in text
     assert "# ElectronicEngineController1.ActualEnginePercentTorque (%, with reference_torque)\n" in text
+
+
+@pytest.mark.parametrize(
+    ("table", "written"),
+    [
+        ('0 "Valid" 1 "Invalid" 3 "SNA"', {"valid_values": [0]}),
+        ('0 "Gut" 1 "Schlecht"', {"valid_values": "?"}),
+        ("", {}),
+    ],
+)
+def test_codes_that_vouch_come_from_the_value_table_or_stay_open(table, written, tmp_path, capsys):
+    text = (FIELD / "field.dbc").read_text()
+    pin = int(text.partition(" DrawbarPin:")[0].rpartition("BO_ ")[2])
+    text = re.sub(rf"^VAL_ {pin} Valid .*\n", "", text, flags=re.MULTILINE)
+    path = tmp_path / "pin.dbc"
+    path.write_text(text + (f"VAL_ {pin} Valid {table} ;\n" if table else ""))
+    draft = proposed(capsys, path)["signals"]["draft"]
+    assert draft == {"signal": "DrawbarPin.Draft", "valid": "Valid"} | written
 
 
 def test_a_comment_on_the_direction_sets_the_sign(capsys):

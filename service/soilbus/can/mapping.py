@@ -12,6 +12,7 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
+from soilbus.can.validity import meaning, vouching_codes
 from soilbus.config.model import Axle, Config, ConfigError, Wheel
 from soilbus.config.model import Signal as Mapped
 from soilbus.words import did_you_mean
@@ -154,7 +155,7 @@ def _measured_once(config: Config) -> Iterator[_Role]:
 def _channel(config: Config, database: Database, role: _Role) -> Channel:
     message, signal = _find(database, role.mapped.signal)
     low, high = plausible(config, role.quantity, role.part)
-    valid_signal = _valid_signal(message, role.mapped)
+    valid_signal, valid_values = _validity(message, role.mapped)
     return Channel(
         quantity=role.quantity,
         wheel=role.part.name if role.part else "",
@@ -165,7 +166,7 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         low=low,
         high=high,
         valid_signal=valid_signal,
-        valid_values=tuple(role.mapped.valid_values) if valid_signal else (),
+        valid_values=valid_values,
         timeout=role.mapped.timeout or _usual_timeout(role, message),
         delay=role.mapped.delay,
         key=role.where,
@@ -198,20 +199,31 @@ def _find_signal(message: Message, name: str) -> Signal:
         raise _Fault(str(error)) from None
 
 
-def _valid_signal(message: Message, mapped: Mapped) -> str | None:
-    """Name of the signal that vouches for the mapped one; a fault when it never could."""
+USUALLY_VALID = 1
+"""Code that vouches where neither the configuration nor a value table says which."""
+
+
+def _validity(message: Message, mapped: Mapped) -> tuple[str | None, tuple[int, ...]]:
+    """Name of the signal that vouches for the mapped one, and its codes that do; a fault when they never could."""
     if mapped.valid is None:
-        return None
+        return None, ()
     before, dot, name = mapped.valid.rpartition(".")
     if dot and before != message.name:
         raise _Fault(f"valid = {mapped.valid} is not in message {message.name}, where it must be")
     signal = _find_signal(message, name)
     if signal.conversion.is_float:
         raise _Fault(f"valid = {mapped.valid} is a float; it must be a code")
+    codes = mapped.valid_values
+    if codes is None:
+        codes = list(vouching_codes(signal)) or [USUALLY_VALID]
     low, high = code_limits(signal)
-    if not any(low <= code <= high for code in mapped.valid_values):
-        raise _Fault(f"valid_values {mapped.valid_values} never occur in {mapped.valid}, which has {low}..{high}")
-    return name
+    if not any(low <= code <= high for code in codes):
+        raise _Fault(f"valid_values {codes} never occur in {mapped.valid}, which has {low}..{high}")
+    names = {code: str(name) for code, name in (signal.choices or {}).items()}
+    if wrong := [f'{code} is "{names[code]}"' for code in codes if meaning(names.get(code, ""))]:
+        asked = "give valid_values" if mapped.valid_values is None else "valid_values cannot hold it"
+        raise _Fault(f"{mapped.valid}: {', '.join(wrong)} in the DBC's value table; {asked}")
+    return name, tuple(codes)
 
 
 def _factor(role: _Role, signal: Signal) -> float:

@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn, code_limits
 
-__all__ = ["REASONS", "CodeRule", "Verdicts", "in_si", "judge_codes", "judge_validity", "meaning", "rule_of"]
+__all__ = [
+    "REASONS",
+    "CodeRule",
+    "Verdicts",
+    "in_si",
+    "judge_codes",
+    "judge_validity",
+    "meaning",
+    "rule_of",
+    "vouches",
+    "vouching_codes",
+]
 
 REASONS = tuple(Reason)
 """A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
@@ -35,6 +46,9 @@ _NO_FAULT = re.compile(r"\b(no|not|without|non) (an )?(errors?|faults?|failures?
 _NOT_AVAILABLE = re.compile(r"\b(sna|n a|na|unavailable|not ?(avail\w*|installed|present)|no (data|signal))\b")
 _ERROR = re.compile(r"\b(err|errors?|invalid|not valid|faults?|faulty|fail(ed|ure)?|defect(ive)?|malfunction)\b")
 _RESERVED = re.compile(r"\b(reserved|rsvd)\b")
+_VOUCHING = re.compile(r"\b(valid|ok|okay|good|normal|healthy|available|yes|true)\b")
+_OF_WHAT = re.compile(r"\b(signal|data|values?|status|state|quality|measurement|sensor|operation|is|detected)\b")
+"""Words beside a vouching one that change nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +86,30 @@ def rule_of(signal: Signal) -> CodeRule:
 
 def meaning(name: str) -> Reason | None:
     """Why a code of that name in a value table is no value; None when it is one."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    text = " ".join(re.findall(r"[a-z0-9]+", words.lower()))
+    text = _in_words(name)
     if _NOT_AVAILABLE.search(text):
         return Reason.NOT_AVAILABLE
     if _ERROR.search(_NO_FAULT.sub("", text)):
         return Reason.ERROR
     return Reason.RESERVED if _RESERVED.search(text) else None
+
+
+def vouches(name: str) -> bool:
+    """Whether a code of that name in a value table says that another signal is valid, and nothing else."""
+    text = _NO_FAULT.sub("ok", _in_words(name))
+    rest, count = _VOUCHING.subn("", _OF_WHAT.sub("", text))
+    return meaning(name) is None and count > 0 and not rest.strip()
+
+
+def vouching_codes(signal: Signal) -> tuple[int, ...]:
+    """Raw codes that vouch for another signal by their names in the value table; () where no name says so."""
+    return tuple(sorted(code for code, name in (signal.choices or {}).items() if vouches(str(name))))
+
+
+def _in_words(name: str) -> str:
+    """Small words with one blank between them."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return " ".join(re.findall(r"[a-z0-9]+", words.lower()))
 
 
 def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Verdicts:

@@ -177,9 +177,9 @@ class Signal(_Section):
     at: Literal["wheel", "shaft"] | None = None
     """Side of the gear on which a torque or speed is measured."""
     valid: str | None = None
-    """Signal, of the same message or another, that must hold one of `valid_values` for the value to count."""
-    valid_values: list[int] = Field(default_factory=lambda: [1])
-    """See `valid`."""
+    """Signal of the same message that must hold one of `valid_values` for the value to count."""
+    valid_values: list[int] | None = None
+    """Codes of `valid`; by default those that the DBC's value table calls valid, ok, normal and the like, else 1."""
     timeout: PositiveFloat | None = None
     """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0

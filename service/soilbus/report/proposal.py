@@ -13,10 +13,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from cantools.database.can import Database, Message
+from cantools.database.can import Database, Message, Signal
 
 from soilbus.can.mapping import VEHICLE_ROLES
 from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, dimensions_of, is_word_in, shown
+from soilbus.can.validity import vouching_codes
 from soilbus.config.file import OPEN
 from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts, is_absent
@@ -81,16 +82,19 @@ class _Draft:
         message = self.database.get_message_by_name(c.message)
         short = [s.name for s in message.signals if s.length <= MOST_STATE_BITS]
         state = next((name for name in short if is_word_in(name, "state")), "")
-        if valid := _valid_signal(message, c):
-            more["valid"] = valid
+        valid = _valid_signal(message, c)
         back = self.facts.backward.get(c.path)
         said = _said_backward(message, c)
-        parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())]
+        parts = [f'signal = "{c.path}"', *(f"{k} = {_quoted(v)}" for k, v in more.items())]
+        parts += [] if valid is None else [f"valid = {_quoted(valid.name)}", *_valid_values(valid)]
         parts += ["sign = -1"] * bool(back or said)
         value = f"{{ {', '.join(parts)} }}" if len(parts) > 1 else f'"{c.path}"'
         remarks = [f"negative in {back} in the log"] if back else [f"the DBC: {said}"] if said else []
         if state and c.slot.role == "torque":
             remarks.append(f'does {state} vouch for it? then valid = "{state}", valid_values = [...]')
+        if valid is not None and valid.choices and not vouching_codes(valid):
+            names = ", ".join(f'{code} "{" ".join(str(name).split())}"' for code, name in sorted(valid.choices.items()))
+            remarks.append(f"which of {names} vouch for it?")
         remarks += ["no unit in the DBC: SI assumed"] if not c.unit and c.dimension else []
         self.put(key, value, "; ".join(remarks))
 
@@ -391,10 +395,18 @@ def _said_backward(message: Message, c: Candidate) -> str:
     return found[0] if (found := re.search(pattern, comment, re.IGNORECASE)) else ""
 
 
-def _valid_signal(message: Message, c: Candidate) -> str:
-    """The one signal of the message that vouches for another; "" where there is none, or several."""
-    found = [s.name for s in message.signals if s.name != c.signal and s.length <= 2 and is_word_in(s.name, "valid")]
-    return found[0] if len(found) == 1 else ""
+def _valid_signal(message: Message, c: Candidate) -> Signal | None:
+    """The one signal of the message that vouches for another; None where there is none, or several."""
+    found = [s for s in message.signals if s.name != c.signal and s.length <= 2 and is_word_in(s.name, "valid")]
+    return found[0] if len(found) == 1 else None
+
+
+def _valid_values(valid: Signal) -> list[str]:
+    """The codes that vouch by the value table, open where its names do not say; nothing without a table."""
+    if not valid.choices:
+        return []
+    codes = list(vouching_codes(valid))
+    return [f"valid_values = {codes}" if codes else f'valid_values = "{OPEN}"']
 
 
 def _rounded(ratio: float) -> str:
