@@ -13,7 +13,7 @@ from soilbus.can.log_writer import write_log
 from soilbus.diagnosis.records import TooLittle
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window
 from soilbus.offline.recordings import parts, recordings_of
-from soilbus.offline.replay import fed
+from soilbus.offline.replay import LogError, fed
 from soilbus.pipeline.intake import Intake
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
@@ -105,6 +105,19 @@ def test_parts_too_short_are_reported_and_left_out(log, tmp_path):
     found = recordings_of(CONFIG, DATABASE, [two])
     assert [record.name for record in found.records] == ["two.log"]
     assert found.too_short == ("two.log, part 2",)
+
+
+def test_a_recording_given_twice_is_refused_whatever_its_name(log, tmp_path):
+    copy, link, other = (tmp_path / name for name in ("copy.log", "link.log", "other.log"))
+    copy.write_bytes(log.read_bytes())
+    link.symlink_to(log)
+    for twice in (log, copy, link):
+        with pytest.raises(LogError) as fault:
+            recordings_of(CONFIG, DATABASE, [log, twice])
+        assert str(fault.value) == f"{log} and {twice} are the same recording, which counts once: leave one out"
+    other.write_text("".join(shifted(line, 1.0) for line in log.open()))  # another one, of the same size
+    assert other.stat().st_size == log.stat().st_size
+    assert len(recordings_of(CONFIG, DATABASE, [log, other]).records) == 2
 
 
 def test_what_was_never_heard_is_reported(log, tmp_path):

@@ -6,9 +6,12 @@ left out and named.
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
+import stat
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,12 +77,13 @@ def recordings_of(
     Raises
     ------
     LogError
-        A log cannot be read to its end (with `partial`: at all), or is of another bus.
+        A log cannot be read to its end (with `partial`: at all), is of another bus, or is given twice.
     TooLittle
         A log has no usable part.
     ConfigError
         Configuration and database do not fit together.
     """
+    check_different(logs)
     rig, model, settings = rig_of(config), model_of(config), config.estimator
     effects, free = effects_and_parameters_of(config, undelayed=False)
     records: list[Record] = []
@@ -102,6 +106,41 @@ def recordings_of(
         if len(records) == first[-1]:
             raise TooLittle(_why(log, intake, fault))
     return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
+
+
+def check_different(logs: Sequence[Path]) -> None:
+    """Refuse a recording that is given twice, as one file or as a copy: its evidence would count twice.
+
+    Files that differ in size are not read.
+
+    Raises
+    ------
+    LogError
+        Two logs are the same file or have the same bytes, or one of two of the same size cannot be read.
+    """
+    known = [(log, log.stat()) for log in logs if os.path.exists(log)]
+    _check_unlike((log, (status.st_dev, status.st_ino)) for log, status in known)
+    sizes = Counter(status.st_size for _, status in known)
+    _check_unlike(
+        (log, _digest(log)) for log, status in known if stat.S_ISREG(status.st_mode) and sizes[status.st_size] > 1
+    )
+
+
+def _check_unlike(logs: Iterable[tuple[Path, Hashable]]) -> None:
+    """Refuse two logs that have the same mark."""
+    first: dict[Hashable, Path] = {}
+    for log, mark in logs:
+        if mark in first:
+            raise LogError(f"{first[mark]} and {log} are the same recording, which counts once: leave one out")
+        first[mark] = log
+
+
+def _digest(log: Path) -> bytes:
+    try:
+        with log.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").digest()
+    except OSError as error:
+        raise LogError(f"{log}: {error.strerror}") from None
 
 
 def parts(

@@ -25,7 +25,7 @@ from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
 from soilbus.estimation.window import Rig, Window, window_of_samples
-from soilbus.offline.recordings import Recordings
+from soilbus.offline.recordings import Recordings, check_different
 from soilbus.offline.replay import LogError, log_names
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask, column_means
@@ -160,7 +160,11 @@ def _task(index: int, run: Run, rig: Rig) -> WindowTask:
 
 
 def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
-    """The runs of tables as the diagnosis wants them; TableError as runs_of(), TooLittle for a table of short runs."""
+    """The runs of tables as the diagnosis wants them.
+
+    TableError as runs_of(), LogError for a table given twice, TooLittle for a table of short runs.
+    """
+    check_different(paths)
     rig, model = rig_of(config), model_of(config)
     effects, free = effects_and_parameters_of(config)
     records: list[Record] = []
