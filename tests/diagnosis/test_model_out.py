@@ -95,6 +95,30 @@ def test_effects_in_the_file_are_replaced(tmp_path):
     assert [effect["name"] for effect in tomllib.loads(text)["model"]["effects"]] == ["multipass"]
 
 
+@pytest.mark.parametrize("effects", [[], [{"name": "lugs", "height": 0.03}, {"name": "multipass", "stiffness": 0.5}]])
+@pytest.mark.parametrize("notes", [(), ("grade (slope) is left out", "lugs (height) is at its edge")])
+@pytest.mark.parametrize(
+    "model",
+    [
+        "",
+        "model = { effects = [], shear_law = 'rational' }  # inline",
+        "model.effects = []",
+        "model.effects = []\nmodel.shear_law = 'rational'",
+        "[model]\nshear_law = 'rational'  # own",
+        "[[model.effects]]\nname = 'lugs'",
+    ],
+)
+def test_effects_and_notes_go_into_every_form_of_the_table(model, notes, effects, tmp_path):
+    path = tmp_path / "any.toml"
+    path.write_text(f"{model}\n{TRACTOR.read_text()}")
+    text = with_effects_text(path, [], effects, tmp_path, notes)
+    expected = tomllib.loads(path.read_text())
+    expected.setdefault("model", {})["effects"] = effects
+    assert tomllib.loads(text) == expected
+    assert [note for note in notes if f"# {note}\n" not in text] == []
+    assert [comment for comment in ("# inline\n", "# own\n") if comment in model + "\n" and comment not in text] == []
+
+
 def test_dbc_files_are_found_from_the_new_place(tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
     (here / "dbc").mkdir(parents=True), there.mkdir()

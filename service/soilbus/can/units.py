@@ -32,7 +32,6 @@ _SPELLINGS: dict[tuple[str, float], str] = {
     ("torque", 1.0): "nm n.m n*m n-m newtonmeter newtonmetre",
     ("torque", 1e3): "knm kn.m kn*m kn-m",
     ("torque", 1e-2): "ncm n.cm n*cm",
-    ("torque", 1e-3): "mnm mn.m mn*m",
     ("torque", 1.3558179483314004): "lbft lbfft lbf.ft lb.ft ftlb ft.lb ft.lbf",
     ("rotation", 1.0): "rad/s rad/sec rad.s-1 rads-1",
     ("rotation", 2.0 * math.pi): "rev/s r/s rps turns/s",
@@ -70,8 +69,8 @@ _UNITS = {
     for (dimension, factor), spellings in _SPELLINGS.items()
     for spelling in spellings.split()
 }
-# folding the case of these would lose a factor of a thousand million
-_MEGA_MILLI = {"MNm": Unit("torque", 1e6), "MN": Unit("force", 1e6), "mN": Unit("force", 1e-3)}
+_MEGA_MILLI = {"M": 1e6, "m": 1e-3}
+"""Prefixes of the newton in its units, which their case alone tells apart."""
 _SAME_CHARACTER = str.maketrans(
     {"·": ".", "⋅": ".", "∙": ".", "•": ".", "×": "*", "²": "2", "⁻": "-", "¹": "1", "º": "°", "^": ""}
 )
@@ -92,7 +91,19 @@ def unit_of(text: str | None) -> Unit | None:
     tidy = "".join(tidy.split()).removeprefix("[").removesuffix("]")
     if not tidy or tidy in ("-", "1"):
         return None
-    unit = _MEGA_MILLI.get(tidy) or _UNITS.get(tidy.casefold())
+    unit = _prefixed(tidy) or _UNITS.get(tidy.casefold())
     if unit is None:
         raise ValueError(_WHY_NOT.get(tidy.casefold(), f"unit {text!r} is not known"))
     return unit
+
+
+def _prefixed(tidy: str) -> Unit | None:
+    """The unit of a text with M or m before one of newtons; None for another text.
+
+    In capitals alone (MNM) the case of the prefix says nothing.
+    """
+    prefix, rest = tidy[:1], tidy[1:].casefold()
+    unit = _UNITS.get(rest) if prefix in _MEGA_MILLI and rest.startswith("n") else None
+    if unit is None or (len(rest) > 1 and tidy.isupper()):
+        return None
+    return Unit(unit.dimension, _MEGA_MILLI[prefix] * unit.factor)

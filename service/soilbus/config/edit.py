@@ -16,7 +16,7 @@ EffectTable = Mapping[str, Any]
 
 
 def with_effects_text(
-    path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Iterable[str] = ()
+    path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Sequence[str] = ()
 ) -> str:
     """The text of a configuration file with overrides in force and other effects.
 
@@ -31,7 +31,7 @@ def with_effects_text(
     place
         Folder that the text will be kept in; DBC files are named so that they are found from there.
     notes
-        Comments at the effects.
+        Comments below the effects, in the same array: there they may stand in every form of the table.
 
     Raises
     ------
@@ -42,9 +42,7 @@ def with_effects_text(
     document = overridden(tomlkit.parse(path.read_text(encoding="utf-8")), overrides)
     if "model" not in document:
         document["model"] = tomlkit.table()
-    document["model"]["effects"] = _array(effects)
-    for note in notes:
-        document["model"].add(tomlkit.comment(note))
+    document["model"]["effects"] = _array(effects, notes)
     if config.dbc.input:
         document["dbc"]["input"] = [_from(place, config.folder, name) for name in config.dbc.input]
     if (renamed := _from(place, config.folder, config.output.dbc)) != config.output.dbc:
@@ -52,10 +50,14 @@ def with_effects_text(
     return tomlkit.dumps(document)
 
 
-def _array(effects: Sequence[EffectTable]) -> Any:
-    array = tomlkit.array().multiline(len(effects) > 0)
+def _array(effects: Sequence[EffectTable], notes: Sequence[str]) -> Any:
+    array = tomlkit.array()
     for effect in effects:
-        array.append(_inline(effect))
+        array.add_line(_inline(effect))
+    for note in notes:
+        array.add_line(comment=note)
+    if effects or notes:
+        array.add_line(indent="")
     return array
 
 
