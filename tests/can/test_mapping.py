@@ -304,8 +304,10 @@ def test_field_vehicle() -> None:
     [
         *((s, "torque", 1.0) for s in ("N.m", "Nm", "N*m", "N·m", "NM", " N m ", "N-m", "[Nm]")),
         ("kNm", "torque", 1e3),
-        ("mNm", "torque", 1e-3),
-        ("MNm", "torque", 1e6),
+        *((s, "torque", 1e-3) for s in ("mNm", "mN.m", "mN·m", "mN*m", "mN-m", "m N m", "mnm")),
+        *((s, "torque", 1e6) for s in ("MNm", "MN.m", "MN·m", "MN*m", "MN-m", "[MN m]")),
+        ("MN", "force", 1e6),
+        ("mN", "force", 1e-3),
         *((s, "rotation", 1.0) for s in ("rad/s", "Rad/s", "rad·s⁻¹", "rad s^-1")),
         *((s, "rotation", math.pi / 30.0) for s in ("rpm", "1/min", "r/min", "min⁻¹", "min-1", "RPM")),
         *((s, "rotation", math.pi / 180.0) for s in ("deg/s", "°/s")),
@@ -338,7 +340,7 @@ def test_no_unit(text: str | None) -> None:
     assert unit_of(text) is None
 
 
-@pytest.mark.parametrize("text", ["%", "Hz", "furlong", "N/m", "Pa", "bit"])
+@pytest.mark.parametrize("text", ["%", "Hz", "furlong", "N/m", "Pa", "bit", "MNM", "MN.M"])
 def test_units_that_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         unit_of(text)

@@ -100,10 +100,12 @@ def unit_of(text: str | None) -> Unit | None:
 def _prefixed(tidy: str) -> Unit | None:
     """The unit of a text with M or m before one of newtons; None for another text.
 
-    In capitals alone (MNM) the case of the prefix says nothing.
+    Raises ValueError where all is in capitals (MNM): the case of the prefix then says nothing.
     """
     prefix, rest = tidy[:1], tidy[1:].casefold()
     unit = _UNITS.get(rest) if prefix in _MEGA_MILLI and rest.startswith("n") else None
-    if unit is None or (len(rest) > 1 and tidy.isupper()):
+    if unit is None:
         return None
+    if len(rest) > 1 and tidy.isupper():
+        raise ValueError(f"unit {tidy} may be mega or milli; write N{rest[1:]} after M or m in the DBC")
     return Unit(unit.dimension, _MEGA_MILLI[prefix] * unit.factor)
