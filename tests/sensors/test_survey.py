@@ -509,6 +509,19 @@ def test_two_wheels_unlike_the_other_two_are_named_in_one_line(field_frames):
     assert re.search(r"wheels seem to slip unlike: FL and FR by 0\.[56]\d, RL and RR by 0\.[012]\d: radius", fault)
 
 
+def test_a_channel_that_contradicts_the_others_is_named_by_its_key(rear_drive, tmp_path):
+    """A lock that reads the code of no state all the time."""
+    (tmp_path / "lock.dbc").write_text('VERSION ""\nBU_: X\nBO_ 100 Lock: 1 X\n SG_ State : 0|2@1+ (1,0) [0|3] "" X\n')
+    text = REAR_DRIVE.read_text().replace('"axles.dbc"', '"axles.dbc", "lock.dbc"')
+    config = tmp_path / "lock.toml"
+    config.write_text(text.replace("[vehicle]", '[vehicle]\ndifferential_lock = "Lock.State"'))
+    state = (frame_of(can.Message(frame[0], 100, False, data=[3])) for frame in rear_drive[::20])
+    found = beside(load_config(config), sorted([*rear_drive, *state], key=lambda frame: frame[0]))
+    assert [f.text for f in found.findings] == [
+        "vehicle.differential_lock: contradicts the other sensors in 2 of 2 windows"
+    ]
+
+
 def test_a_locked_differential_turns_both_wheels_alike():
     config = reference_configuration(["axle.rear.differential=locked"], path=REAR_DRIVE)
     recording = simulate(config, scenario_over(["loam"], 20.0), 5)

@@ -926,6 +926,7 @@ def _yaw(facts: Facts) -> Iterator[Finding]:
 def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database) -> Iterator[Finding]:
     """Sensors that contradict the others in many windows, by the checks of `consistency`."""
     s, rig = facts.config.estimator, facts.rig
+    key = {c.name: c.key for c in channels}
     resolution = {c.name: resolution_of(c, database) for c in channels}
     n = max(round(s.window / s.bin), 1)
     named: Counter[str] = Counter()
@@ -937,6 +938,5 @@ def _contradictions(facts: Facts, channels: Iterable[Channel], database: Databas
         named.update(implausible(facts.window.rows(rows), rig, s.min_speed, s.max_turn, s.bin, resolution, motor))
     for name, count in named.items():
         if count > max(LIMITS.windows * len(begins), 1.0):
-            quantity, _, wheel = name.partition(".")
-            key = f"wheel.{wheel}.{quantity}" if wheel else f"signals.{quantity}"
-            yield Finding(f"{key}: contradicts the other sensors in {count} of {len(begins)} windows", False, (name,))
+            text = f"{key.get(name, name)}: contradicts the other sensors in {count} of {len(begins)} windows"
+            yield Finding(text, False, (name,))
