@@ -246,6 +246,13 @@ def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():
     assert not any("_" in words or "too old" in words for words in said.values())
 
 
+def test_an_estimate_without_excitation_does_not_deny_a_slip_that_varies(desk):
+    """The loads may be what hardly varies."""
+    desk.send("SoilbusStatus", State="degraded", Reason="not_excited", Window=1)
+    desk.send("Traversability", State="unknown")
+    assert desk.dashboard.verdict().said == "UNKNOWN: load or slip hardly varies"
+
+
 def luminance(colour: tuple[int, int, int]) -> float:
     """Relative luminance of an sRGB colour, WCAG 2."""
     parts = [c / 255.0 for c in colour]

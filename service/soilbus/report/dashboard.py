@@ -61,7 +61,7 @@ REASONS = {
     "bus_error": ("the bus has errors", "Check the CAN connection"),
     "no_frames": ("nothing on the bus", "Check the CAN connection"),
     "standstill": ("standing still", "Drive on to measure"),
-    "not_excited": ("load and slip hardly vary", "Go carefully, vary the load"),
+    "not_excited": ("load or slip hardly varies", "Go carefully, vary the load"),
     "ambiguous": ("several soils fit", "Go carefully, vary the load"),
     "turning": ("turning", "Drive straight to measure"),
     "input_missing": ("an input never came", "Check the sensors"),
