@@ -253,6 +253,22 @@ def test_an_estimate_without_excitation_does_not_deny_a_slip_that_varies(desk):
     assert desk.dashboard.verdict().said == "UNKNOWN: load or slip hardly varies"
 
 
+@pytest.mark.parametrize(
+    ("slip", "said", "todo"),
+    [
+        (None, "standing still", "Drive on to measure"),
+        (0.2, "standing still", "Drive on to measure"),
+        (0.7, "the wheels spin", "Stop, lift, add no torque"),
+    ],
+)
+def test_wheels_that_spin_on_the_spot_are_not_told_to_drive_on(desk, slip, said, todo):
+    desk.send("SoilbusStatus", State="degraded", Reason="standstill", Window=1)
+    desk.send("WheelSlip", SlipWheel1=0.1, SlipWheel3=slip)
+    desk.send("Traversability", State="unknown")
+    verdict = desk.dashboard.verdict()
+    assert (verdict.said, verdict.todo) == (f"UNKNOWN: {said}", todo)
+
+
 def luminance(colour: tuple[int, int, int]) -> float:
     """Relative luminance of an sRGB colour, WCAG 2."""
     parts = [c / 255.0 for c in colour]

@@ -265,6 +265,9 @@ class Dashboard:
         ):
             was_there = any("draft" in values for _, values in self._samples)
             return "the draft is not heard any more" if was_there else "no sensor shows the draft", "Go carefully"
+        slip = self.slip().value
+        if reason == "standstill" and slip is not None and slip >= CARRYING_SLIP:
+            return "the wheels spin", WARNED_ADVICE  # they make no way, so the service calls it a standstill
         if reason in REASONS:
             return REASONS[reason]
         if known.value("SoilbusStatus", "State") == "estimating":
