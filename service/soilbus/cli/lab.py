@@ -33,7 +33,7 @@ def montecarlo(args: argparse.Namespace) -> None:
             drawn = monte_carlo(
                 config, args.windows, args.seed, each=each, posterior_samples=args.exact, around=args.around
             )
-            cells = list(with_progress(drawn))
+            cells = list(with_progress(drawn, config))
     except SimulationError as error:
         raise WorkError(str(error)) from None
     report(args.json, [as_json(cell) for cell in cells], monte_carlo_report(cells))

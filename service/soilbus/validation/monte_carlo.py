@@ -61,6 +61,7 @@ __all__ = [
     "prior_about",
     "problem_of",
     "processes",
+    "sensor_sets",
     "summary",
     "tasks_of",
     "trials",
@@ -79,7 +80,7 @@ _PHI = PARAMETERS.index("phi")
 
 
 class Task(NamedTuple):
-    """One drive to be simulated and estimated, with and without sinkage sensors.
+    """One drive to be simulated and estimated, once for each of its `sensor_sets`.
 
     posterior_samples is the number of samples of the posterior beside each fit; around the sd of the free
     parameters' logarithms about the named soil (0: that soil).
@@ -198,7 +199,7 @@ def monte_carlo(
     posterior_samples: int = 0,
     around: float = 0.0,
 ) -> Iterator[Cell]:
-    """Cells of all soils and durations, each with and without sinkage sensors on the same drives.
+    """Cells of all soils and durations, each with all `sensor_sets` on the same drives.
 
     Parameters
     ----------
@@ -230,8 +231,8 @@ def monte_carlo(
     tasks = [task for place in places for task in tasks_of(config, *place, windows, seed, posterior_samples, around)]
     results = iter(each(trials, tasks))
     for soil, duration in places:
-        pairs = [next(results) for _ in range(windows)]
-        for sinkage, of_cell in zip((True, False), zip(*pairs, strict=True), strict=True):
+        found = [next(results) for _ in range(windows)]
+        for sinkage, of_cell in zip(sensor_sets(config), zip(*found, strict=True), strict=True):
             yield summary(soil, duration, sinkage, of_cell)
 
 
@@ -259,15 +260,19 @@ def tasks_of(
     return [Task(of_cell, soil, duration, int(s), posterior_samples, around) for s in seeds]
 
 
-def trials(task: Task) -> tuple[Trial, Trial]:
-    """A drive simulated, and its window estimated with and without sinkage sensors.
+def sensor_sets(config: Config) -> tuple[bool, ...]:
+    """Whether sinkage is measured: with and without where a wheel has a sensor of it, else without alone."""
+    return (True, False) if any(wheel.sinkage is not None for wheel in config.wheel) else (False,)
+
+
+def trials(task: Task) -> tuple[Trial, ...]:
+    """A drive simulated, and its window estimated with each of the `sensor_sets`.
 
     Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
     """
     recording, soil = driven(task)
     prior = prior_about(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
-    with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
-    return with_sinkage, without
+    return tuple(_trial(recording, task, prior, soil, sinkage) for sinkage in sensor_sets(task.config))
 
 
 def driven(task: Task) -> tuple[Recording, Soil]:

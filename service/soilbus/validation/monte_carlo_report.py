@@ -9,8 +9,9 @@ import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 
+from soilbus.config.model import Config
 from soilbus.report.table import table
-from soilbus.validation.monte_carlo import SOILS, WINDOW_LENGTHS, BayesRiskFigures, Cell
+from soilbus.validation.monte_carlo import SOILS, WINDOW_LENGTHS, BayesRiskFigures, Cell, sensor_sets
 
 MAX_RMS_RATIO = 1.15
 """Target of the RMS error over the Cramer-Rao bound."""
@@ -28,15 +29,15 @@ of what such a window holds the estimate gets out, and that its intervals are ri
 _BAYES_RISK_CELL = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
 
 
-def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
-    """The same cells, with a progress bar on a terminal."""
+def with_progress(cells: Iterable[Cell], config: Config) -> Iterator[Cell]:
+    """The same cells, those of a configuration, with a progress bar on a terminal."""
     if not sys.stderr.isatty():
         yield from cells
         return
     from rich.console import Console
     from rich.progress import track
 
-    n_cells = 2 * len(SOILS) * len(WINDOW_LENGTHS)
+    n_cells = len(sensor_sets(config)) * len(SOILS) * len(WINDOW_LENGTHS)
     yield from track(cells, "montecarlo", n_cells, console=Console(stderr=True), transient=True)
 
 
