@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.config.file import machine, shipped_dbc
+from soilbus.config.file import load_config, machine, shipped_dbc
+from soilbus.config.model import ConfigError
 
 HERE = Path(__file__).resolve().parent
 FIELD = HERE.parent / "field"
@@ -119,6 +120,21 @@ def test_codes_that_vouch_come_from_the_value_table_or_stay_open(table, written,
     path.write_text(text + (f"VAL_ {pin} Valid {table} ;\n" if table else ""))
     draft = proposed(capsys, path)["signals"]["draft"]
     assert draft == {"signal": "DrawbarPin.Draft", "valid": "Valid"} | written
+
+
+def test_each_open_value_counts_also_two_of_a_line(tmp_path, capsys):
+    valid = ' SG_ Valid : 56|2@1+ (1,0) [0|3] "" CHS\n'
+    dbc = f'VERSION ""\nBU_: CHS\nBO_ 100 Imu: 8 CHS\n SG_ LongAccel : 0|16@1- (0.001,0) [-20|20] "m/s^2" CHS\n{valid}'
+    path, out = tmp_path / "imu.dbc", tmp_path / "out.toml"
+    path.write_text(f'{dbc}VAL_ 100 Valid 0 "Gut" 1 "Schlecht" ;\n')
+    assert main(["init", "--dbc", str(path), "-o", str(out)]) == 0
+    said = capsys.readouterr()
+    count = int(re.search(r"(\d+) values open", said.out + said.err)[1])
+    acceleration = tomllib.loads(out.read_text())["signals"]["acceleration"]
+    assert (acceleration["kind"], acceleration["valid_values"]) == ("?", "?")
+    with pytest.raises(ConfigError) as error:
+        load_config(out)
+    assert len(error.value.faults) == count
 
 
 def test_a_comment_on_the_direction_sets_the_sign(capsys):

@@ -130,7 +130,8 @@ def proposal(database: Database, assignment: Assignment, facts: Facts, files: Se
     _put_signals(draft)
     _put_rest(draft)
     text = "\n".join(draft.lines) + "\n"
-    return Proposal(text, len(draft.used), sum(f'"{OPEN}"' in line for line in draft.lines if not line.startswith("#")))
+    left = sum(line.count(f'"{OPEN}"') for line in draft.lines if not line.startswith("#"))
+    return Proposal(text, len(draft.used), left)
 
 
 # --- which motor drives what ---
