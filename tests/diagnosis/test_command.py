@@ -85,7 +85,8 @@ def test_json_has_the_keys_of_the_design(diagnosed):
     found = diagnosed.found
     assert {"verdict", "where", "effects", "gap", "soil_before", "soil_after", "soils"} <= found.keys()
     for place in found["where"]:
-        assert place.keys() == {"channel", "wheel", "region", "size", "significance"}
+        assert place.keys() == {"channel", "wheel", "region", "size", "significance", "log"}
+        assert place["log"] == ("" if place["region"] == "gain" else "ruts.log")
         assert 0.0 <= place["significance"] <= 0.01
     for soil in (found["soil_before"], found["soil_after"]):
         assert soil.keys() == SOIL_KEYS
