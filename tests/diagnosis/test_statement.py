@@ -16,11 +16,11 @@ from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import Verdict, gap_limit, probabilities, verdict_of
+from soilbus.diagnosis.verdict import Verdict, probabilities, verdict_of
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior
 from soilbus.report.findings import place_lines
-from soilbus.report.statement import doubt, shown_lines, statement, why_probabilities
+from soilbus.report.statement import doubt, headline, shown_lines, statement, why_probabilities
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import soil_named
@@ -46,10 +46,12 @@ def shown(name: str, size: float | None, error: float = 0.0) -> Detectable:
 def diagnoses(draw) -> Diagnosis:
     names = draw(st.lists(st.sampled_from(NAMES), unique=True, max_size=3))
     chances = [draw(st.floats(0.05, 1.0)) for _ in names]
-    before = Gap(draw(st.floats(0.95, 9.0)), draw(st.integers(20, 20000)))
-    after = Gap(draw(st.floats(0.9, 1.0)) + draw(st.floats(0.0, 1.0)) ** 3 * (before.value - 0.9), before.rows)
+    rows, loads = draw(st.integers(20, 20000)), draw(st.sampled_from([1.0, 2.0]))
+    before = Gap(draw(st.floats(0.95, 9.0)), rows, loads)
+    after = Gap(draw(st.floats(0.9, 1.0)) + draw(st.floats(0.0, 1.0)) ** 3 * (before.value - 0.9), rows, loads)
     imitation = (0.9, 0.6, 0.1) if len(names) == 3 and draw(st.booleans()) else ()
-    verdict = verdict_of(before.value, after.value if names else before.value, before.rows, chances, bool(imitation))
+    gaps = before.with_open_loads, (after if names else before).with_open_loads
+    verdict = verdict_of(*gaps, rows, chances, bool(imitation))
     where = draw(st.sampled_from([(), (PLACE,), (PLACE, PLACE)]))
     seen = tuple(shown(n, draw(st.sampled_from([None, 0.1]))) for n in NAMES) if verdict is Verdict.NONE else ()
     added = tuple(map(addition, names, chances))
@@ -74,14 +76,18 @@ def said(found: Diagnosis) -> str:
 def test_no_sentence_contradicts_another(found):
     text = said(found)
     assert not (AGREES.search(text) and MISSING.search(text)), text
-    assert bool(AGREES.search(text)) == (found.verdict is Verdict.NONE and not found.where), text
+    agrees = found.verdict is Verdict.NONE and not found.where and not found.gap_after.exceeds_noise()
+    assert bool(AGREES.search(text)) == agrees, text
+    assert (headline(found) == "Model and data agree") == agrees
 
 
 @settings(max_examples=300, deadline=None)
 @given(diagnoses())
 def test_a_gap_that_is_left_is_said_in_the_first_line(found):
-    is_open = found.gap_after.value > gap_limit(found.gap_after.rows)
-    assert is_open == bool(re.search(r"is left besides|no effect of the catalogue explains", statement(found)))
+    is_unexplained = found.verdict is Verdict.UNKNOWN or found.gap_after.exceeds_noise()
+    assert is_unexplained == bool(re.search(r"the gap of|no effect of the catalogue explains", statement(found)))
+    if found.verdict is not Verdict.UNKNOWN:
+        assert ("wheel loads that shake" in statement(found)) == (is_unexplained and found.gap_after.open_loads > 1.0)
     assert len(statement(found).splitlines()) == 1
 
 

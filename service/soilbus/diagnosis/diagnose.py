@@ -1,6 +1,6 @@
 """The diagnosis: where model and data disagree, which effects are missing, and how much of the gap they explain.
 
-    gap = reduced chi-square of held-out blocks;  fall = -2 log evidence before - after an effect is added
+    gap = reduced chi-square of held-out blocks (`gap`);  fall = -2 log evidence before - after an effect is added
 
 The present model is fitted and its held-out residuals are tested place by place (`where`).  Effects are added one at a
 time, at most three, by stepwise search (`search`); `verdict` turns evidences and remaining gap into a verdict.
@@ -158,8 +158,9 @@ def diagnose(
     rows = min(before.rows, after.rows)
     names = [addition.effect.name for addition in additions]
     is_doubtful = bool(imitation) or not base.converged or any(f.effect in names for f in present.at_limits)
-    verdict = verdict_of(before.value, after.value, rows, chances, is_doubtful, options)
-    if verdict is Verdict.UNKNOWN and not after.value < before.value:  # what explains nothing new is no name
+    verdict = verdict_of(before.with_open_loads, after.with_open_loads, rows, chances, is_doubtful, options)
+    explains = after.with_open_loads < before.with_open_loads
+    if verdict is Verdict.UNKNOWN and not explains:  # what explains nothing new is no name
         additions, present, after, imitation = [], base, before, ()
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()

@@ -8,7 +8,7 @@ are fitted one after the other, each with the posterior of the previous ones as 
 with the likelihood factors of all others in its prior, until all are at the same shared values: the optimum of all
 recordings together, in any order (expectation propagation by Laplace's method: Minka 2001, Proc. UAI 17:362).
 FittedModel.gap, the reduced chi-square of the held-out blocks, says how well the model predicts data that it was not
-fitted to.
+fitted to; `gap` compares it with what the sensors' noise alone leaves.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class FittedModel:
 
     @property
     def gap(self) -> float:
-        """Reduced chi-square of the held-out blocks."""
+        """Reduced chi-square of the held-out blocks, by the covariance that has what computed loads leave open too."""
         return sum(check.chi2 for check in self.checks) / max(self.checked_rows, 1)
 
     @property

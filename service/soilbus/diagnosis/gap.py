@@ -1,6 +1,12 @@
 """How far a model is from the data: reduced chi-square of held-out blocks, each fold held out in turn.
 
-    gap = sum over folds of chi-square / sum over folds of residuals
+    gap = 1 + sum over folds of (chi-square - E[chi-square]) / sum over folds of tr(R C)
+
+With load cells expected chi-square and trace are the number of residuals: reduced chi-square.  The covariance S = C + K
+of computed loads has also what these leave open, K, so that the sensors' noise C alone leaves less: tr(R C), with the
+weights R that all models share (`ObservationModel.expected_chi2`).  Loads that shake as `noise.computed_load` says
+bring the gap to rows / tr(R C) (`Gap.open_loads`): no cell says whether they do.  Eigenvalues of R C are at most 1, so
+noise gives the gap a sd of at most sqrt(2 / tr(R C)).
 
 The gap of the one fold that a diagnosis holds out has a noise of a few per cent, often a tenth of its excess over 1.
 So a model that was found is fitted once more with each other fold held out, from its optimum (cross-validation: Stone
@@ -11,21 +17,87 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.verdict import gap_limit
 from soilbus.estimation.multistart import Start
+from soilbus.estimation.observation_model import RESIDUAL
 from soilbus.estimation.posterior import SoilPrior
 
 
 class Gap(NamedTuple):
-    """Reduced chi-square of held-out residuals, and the number of these."""
+    """Reduced chi-square of held-out residuals.
+
+    Attributes
+    ----------
+    value
+        1 where the sensors' noise alone is left.
+    rows
+        Number of residuals.
+    open_loads
+        The value where computed loads shake as `noise.computed_load` says; 1 where load cells measure them.
+    """
 
     value: float
     rows: int
+    open_loads: float = 1.0
+
+    @property
+    def with_open_loads(self) -> float:
+        """The value where 1 is noise with all that computed loads leave open."""
+        return self.value / self.open_loads
+
+    def limit(self, options: DiagnosisOptions = DEFAULT) -> float:
+        """The value up to which noise alone explains it."""
+        return gap_limit(self.rows / self.open_loads, options)
+
+    def exceeds_noise(self, options: DiagnosisOptions = DEFAULT) -> bool:
+        """Whether more is left than noise alone leaves."""
+        return self.value > self.limit(options)
+
+
+@dataclass(frozen=True, slots=True)
+class _Misfit:
+    """What a sum of folds misses: chi-square beyond the expected one, residuals, and tr(R C)."""
+
+    excess: float
+    rows: int
+    degrees: float
+
+    def __add__(self, other: _Misfit) -> _Misfit:
+        return _Misfit(self.excess + other.excess, self.rows + other.rows, self.degrees + other.degrees)
+
+    @property
+    def gap(self) -> Gap:
+        """The reduced chi-square; of residuals that are no numbers infinite."""
+        if not (math.isfinite(self.excess) and self.degrees > 0.0):
+            return Gap(math.inf, self.rows)
+        return Gap(1.0 + self.excess / self.degrees, self.rows, self.rows / self.degrees)
+
+
+def gap_of_fold(fitted: FittedModel) -> Gap:
+    """The gap of a model over the fold that its records hold out."""
+    return _misfit(fitted).gap
+
+
+def _misfit(fitted: FittedModel) -> _Misfit:
+    """Of the fold that a model's records hold out."""
+    excess, degrees = 0.0, 0.0
+    for check, fit in zip(fitted.checks, fitted.fits, strict=True):
+        problem, at = check.problem, check.at
+        expected = problem.expected_chi2(at, fit.mode.gains)
+        excess += check.chi2 - expected
+        degrees += expected
+        if problem.computes_sides and problem.common_weights is not None:
+            r, R = at.rows[:, RESIDUAL].reshape(problem.n, -1), problem.common_weights
+            degrees += float(np.einsum("ni,nij,nj->", r, R, r)) - at.chi2  # E[chi2] = chi2 - r' R r + tr(R C)
+    return _Misfit(excess, fitted.checked_rows, degrees)
 
 
 def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> Gap:
@@ -34,10 +106,10 @@ def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> 
     Over the one fold only where its gap exceeds `max_cross_validated`, where no other can be held out (tables), and
     where the model or a further fit did not converge.
     """
-    options, one_fold = records[0].options, Gap(fitted.gap, fitted.checked_rows)
+    options, of_folds = records[0].options, _misfit(fitted)
+    one_fold = of_folds.gap
     if not fitted.converged or fitted.gap > options.max_cross_validated:
         return one_fold
-    chi2, rows = fitted.gap * fitted.checked_rows, fitted.checked_rows
     for fold in range(options.folds - 1):
         divided = [record.with_held_out(fold) for record in records]
         parts = [record for record in divided if record is not None]
@@ -47,9 +119,8 @@ def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> 
         refitted = fit_model(parts, prior, fitted.effects, starts)
         if refitted is None or not math.isfinite(refitted.gap):
             return one_fold
-        chi2 += refitted.gap * refitted.checked_rows
-        rows += refitted.checked_rows
-    return Gap(chi2 / max(rows, 1), rows)
+        of_folds += _misfit(refitted)
+    return of_folds.gap
 
 
 def _start(record: Record, fold: int, end: Start) -> Start:

@@ -18,12 +18,12 @@ from dataclasses import dataclass, field, replace
 
 from soilbus.diagnosis.delays import exceeds_sampling_delay
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.gap import gap_of_fold
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Score, further_scores, scores
 from soilbus.diagnosis.verdict import (
     dominated_deficit,
-    gap_limit,
     mean_soil_error_share,
     probabilities,
     required_fall,
@@ -215,7 +215,7 @@ class Search:
         effect = model.effects[-1]
         return (
             bool(effect.late)
-            and without.gap <= gap_limit(without.checked_rows, self.options)
+            and not gap_of_fold(without).exceeds_noise(self.options)
             and not exceeds_sampling_delay(self.full.records, self.full.prior, model, effect, self.temperature)
         )
 

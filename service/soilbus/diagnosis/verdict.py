@@ -9,7 +9,8 @@ within a relative entropy in proportion to E only (coarsened posterior: Miller &
 114:1113).  Where nothing is missing zeta is zeta_0, as residuals that follow each other are not independent.
 A priori nothing is missing with probability 1/2, and every effect with 1 / 2 K.  An effect is added where it is more
 probable than none, and explains a good part of the gap and more than the formulas of the others may leave; the verdict
-is `unknown` where too much of the gap remains.
+is `unknown` where too much of the gap remains: where loads are computed, too much for all that these leave open, as
+loads that shake are no effect.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def verdict_of(
     Parameters
     ----------
     before, after
-        Gaps (reduced chi-square) under the present model and with the effects added.
+        Gaps (reduced chi-square) under the present model and with the effects added; where loads are computed with all
+        that these leave open (Gap.with_open_loads).
     rows
         Held-out residuals of which the gaps are.
     chances
@@ -75,9 +77,9 @@ def is_unexplained(before: float, after: float, checked_rows: int, options: Diag
     return not (after <= gap_limit(checked_rows, options) or is_explained)
 
 
-def gap_limit(rows: int, options: DiagnosisOptions = DEFAULT) -> float:
-    """Reduced chi-square of this number of held-out residuals up to which noise explains them."""
-    return max(options.least_gap_limit, 1.0 + options.gap_limit_sd * math.sqrt(2.0 / max(rows, 1)))
+def gap_limit(degrees: float, options: DiagnosisOptions = DEFAULT) -> float:
+    """Reduced chi-square of this number of held-out residuals, degrees of freedom, up to which noise explains them."""
+    return max(options.least_gap_limit, 1.0 + options.gap_limit_sd * math.sqrt(2.0 / max(degrees, 1.0)))
 
 
 def temperature(excess: float, options: DiagnosisOptions = DEFAULT) -> float:

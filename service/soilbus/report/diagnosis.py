@@ -31,6 +31,7 @@ from soilbus.report.page import Picture, Source, Table, page
 from soilbus.report.statement import (
     doubt,
     headline,
+    is_open,
     plain_gap,
     shown_lines,
     statement,
@@ -89,7 +90,8 @@ def _sums(findings: Findings) -> Iterator[tuple[str, Picture]]:
     """Caption and picture of the gaps, and of the largest draft."""
     diagnosis = findings.diagnosis
     gaps = gap_picture(diagnosis.base, diagnosis.completed)
-    yield "How far each channel is from the model: 1 is as near as the sensors’ noise allows.", gaps
+    loads = " with what computed loads leave open" if diagnosis.gap_before.open_loads > 1.0 else ""
+    yield f"How far each channel is from the model: 1 is as near as the sensors’ noise{loads} allows.", gaps
     drafts = draft_picture(findings)
     if drafts is not None:
         yield "Largest steady draft on the level, by the soil of each recording.", drafts
@@ -148,7 +150,9 @@ def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterat
         yield "See what the service makes of the recording with it:", command, []
     if diagnosis.verdict is Verdict.UNKNOWN:
         yield "Check mass, radii, gear ratios, signs and mounting of the channels that disagree most.", "", []
-    if diagnosis.verdict is Verdict.NONE:
+    if diagnosis.verdict is Verdict.NONE and is_open(diagnosis):
+        yield "Compare the noise that the configuration states with that of the sensors; measure wheel loads.", "", []
+    elif diagnosis.verdict is Verdict.NONE:
         yield "Nothing is to be added. Smaller effects show in longer recordings that vary the load more.", "", []
     for sentence, lines in to_tell_apart(diagnosis):
         yield sentence, "", lines

@@ -16,7 +16,6 @@ from soilbus.config.model import Config
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.diagnose import Findings
@@ -31,6 +30,7 @@ from soilbus.report.statement import (
     same_push,
     shown_lines,
     statement,
+    what_loads_may_do,
     why_probabilities,
 )
 from soilbus.report.table import AT_EDGE, table, value_text
@@ -63,7 +63,8 @@ def findings_record(findings: Findings) -> dict[str, Any]:
             "before": diagnosis.gap_before.value,
             "after": diagnosis.gap_after.value,
             "noise_floor": 1.0,
-            "limit": gap_limit(diagnosis.gap_after.rows),
+            "limit": diagnosis.gap_after.limit(),
+            "open_loads": diagnosis.gap_after.open_loads,
             "residuals": diagnosis.gap_after.rows,
             "open": is_open(diagnosis),
         },
@@ -178,9 +179,10 @@ def findings_text(findings: Findings) -> str:
 def gap_line(findings: Findings) -> str:
     """The gap before and after, and that of noise alone."""
     before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
+    loads = f"; {what_loads_may_do(after)}" if after.open_loads > 1.0 else ""
     return (
         f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
-        f"noise alone: 1, hardly ever above {gap_limit(after.rows):.2f})"
+        f"noise alone: 1, hardly ever above {after.limit():.2f}{loads})"
     )
 
 
