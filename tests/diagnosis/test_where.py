@@ -7,14 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.model_out import effect_tables
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.where import Disagreement, disagreements
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
+from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)
@@ -117,3 +120,41 @@ def test_a_place_names_its_recording():
     assert base is not None
     found = disagreements(records, base)
     assert (found[0].channel, found[0].wheel, found[0].log) == ("torque", "RL", "late.log")
+
+
+def test_an_effect_of_the_configuration_that_the_data_refute_is_a_place(refuted):
+    """A loss of 15 +- 2 % where there is none ends at the edge of its range, 7.5 standard deviations away."""
+    record, base = refuted
+    (found,) = disagreements([record], base)
+    assert (found.channel, found.region, found.size) == ("drivetrain_loss", "parameter share", -0.15)
+    assert found.significance < 1e-6
+
+
+def test_an_effect_of_the_configuration_that_is_there_is_no_place():
+    config = with_effects(CONFIG, ["drivetrain_loss=0.15"])
+    record, base = beside_loss(recorded("loam", 40.0, 2, config=config))
+    assert disagreements([record], base) == []
+
+
+def beside_loss(record: Record) -> tuple[Record, FittedModel]:
+    """The record and its fit under a model that says 0.15 +- 0.02 of a drivetrain's loss, and holds the rest."""
+    loss = CATALOGUE["drivetrain_loss"]
+    free = [
+        dataclasses.replace(f, value=0.15, std=0.02) if f.parameter.name == "share" else dataclasses.replace(f, std=0.0)
+        for f in parameters_of(loss, 4)
+    ]
+    record = record.with_effects([loss], free)
+    base = fit_model([record], prior_of(CONFIG), [loss])
+    assert base is not None
+    return record, base
+
+
+@pytest.fixture(scope="module")
+def refuted() -> tuple[Record, FittedModel]:
+    return beside_loss(recorded("loam", 40.0, 4))
+
+
+def test_what_a_fit_holds_at_its_edge_is_written_with_its_prior_std(refuted):
+    (table,), _ = effect_tables(refuted[1])
+    assert table["share"] == {"value": 0.0, "std": 0.02}
+    assert table["drag"] == {"value": 0.0}

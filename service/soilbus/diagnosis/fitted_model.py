@@ -183,14 +183,25 @@ class FittedModel:
         gaussian, problem = self.fits[-1].mode, self.checks[-1].problem
         std = np.sqrt(np.diag(gaussian.covariance))[_SOIL + problem.n_sensors :]
         out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
-        for free, standardised, spread in zip(
-            self.free, gaussian.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True
+        for free, name, standardised, spread in zip(
+            self.free, self.parameter_names(), gaussian.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True
         ):
-            name = free.parameter.name + ("" if free.wheel is None else f"_{problem.rig.wheels[free.wheel]}")
             out[free.effect][name] = Estimate(free.at(standardised), free.std * spread)
         for (effect, name), estimate in self.reported.items():
             out[effect][name] = estimate
         return out
+
+    def prior_parameters(self) -> dict[str, dict[str, Estimate]]:
+        """The same before any recording; the std of one that is held is 0."""
+        out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
+        for free, name in zip(self.free_unheld, self.parameter_names(), strict=True):
+            out[free.effect][name] = Estimate(free.value, free.std)
+        return out
+
+    def parameter_names(self) -> list[str]:
+        """Name of each of `free`; a wheel's own is named name_WHEEL."""
+        wheels = self.checks[-1].problem.rig.wheels
+        return [f.parameter.name + ("" if f.wheel is None else f"_{wheels[f.wheel]}") for f in self.free]
 
     def as_starts(self, effects: Sequence[Effect] | None = None) -> tuple[Start, ...]:
         """A start at each optimum, for fits in which no parameter is held yet.

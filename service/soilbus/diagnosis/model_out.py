@@ -18,16 +18,18 @@ def effect_tables(fitted: FittedModel) -> tuple[list[dict[str, Any]], list[str]]
     -------
     list of dict
         A table for each effect, {name, parameter = {value, std}}; a parameter that every wheel has for itself is a
-        table by wheel.
+        table by wheel.  One at the edge of its range, where the data leave no std, keeps that of its prior: it is not
+        held there for ever.
     list of str
         Notes on what is left out: what describes the recording only, as its ground, or how a zero wandered in it.
     """
     tables: list[dict[str, Any]] = []
     notes: list[str] = []
-    values = fitted.parameters()
+    values, priors = fitted.parameters(), fitted.prior_parameters()
     wheels = fitted.checks[-1].problem.rig.wheels
     for effect in fitted.effects:
-        found = {name: _value_table(estimate) for name, estimate in values[effect.name].items()}
+        of_effect = values[effect.name]
+        found = {name: _value_table(of_effect[name], prior.std) for name, prior in priors[effect.name].items()}
         kept: dict[str, Any] = {}
         left_out: list[str] = []
         for p in effect.parameters:
@@ -47,6 +49,7 @@ def effect_tables(fitted: FittedModel) -> tuple[list[dict[str, Any]], list[str]]
     return tables, notes
 
 
-def _value_table(estimate: Estimate) -> dict[str, float]:
-    table = {"value": estimate.value} if estimate.std == 0.0 else {"value": estimate.value, "std": estimate.std}
+def _value_table(estimate: Estimate, prior_std: float) -> dict[str, float]:
+    std = estimate.std or prior_std
+    table = {"value": estimate.value, "std": std} if std > 0.0 else {"value": estimate.value}
     return {name: float(f"{number:.{SIGNIFICANT_DIGITS}g}") for name, number in table.items()}

@@ -4,8 +4,9 @@
 
 Each residual of the held-out blocks, given the others of its instant, is standard normal where nothing is missing.  So
 is the mean over a region divided by its standard deviation, which includes noise and what the fit leaves uncertain of
-soil, gains and effects.  Each region is one test; the significance reported is corrected for the number of all tests
-(Holm 1979, Scand. J. Statist. 6:65).
+soil, gains and effects.  So is the shift of a gain error or of an effect's parameter from its prior over its standard
+deviation, sqrt(prior variance - posterior variance).  Each region and each of these is one test; the significance
+reported is corrected for the number of all tests (Holm 1979, Scand. J. Statist. 6:65).
 """
 
 from __future__ import annotations
@@ -36,16 +37,17 @@ class Disagreement:
     Attributes
     ----------
     channel
-        torque, draft or sinkage, or a sensor whose gain error is implausible.
+        torque, draft or sinkage, a sensor whose gain error is implausible, or an effect of the present model.
     wheel
         Its name; empty for a channel of the vehicle.
     region
-        `everywhere`, `slip 0.20..0.35` and the like, `scatter` (residuals larger than noise, of either sign) or
-        `gain`.
+        `everywhere`, `slip 0.20..0.35` and the like, `scatter` (residuals larger than noise, of either sign), `gain`
+        or `parameter share` and the like.
     size
-        Mean of reading less model [SI]; of a scatter the residuals' std over the noise's, of a gain the gain error.
+        Mean of reading less model [SI]; of a scatter the residuals' std over the noise's, of a gain the gain error, of
+        a parameter [its unit] the fitted value less that of the prior.
     log
-        Name of the recording; empty for a gain, which all of them share.
+        Name of the recording; empty for a gain and a parameter, which all of them share.
     significance
         Probability that noise alone does as much in any of the tests.
     """
@@ -66,7 +68,7 @@ def disagreements(records: Sequence[Record], fitted: FittedModel) -> list[Disagr
         for record, check, fit in zip(records, fitted.checks, fitted.fits, strict=True)
         for test in _tests(record.name, check, fit.mode, options)
     ]
-    tests += list(_gain_tests(fitted, options))
+    tests += [*_gain_tests(fitted, options), *_parameter_tests(fitted, options)]
     tests.sort(key=lambda test: -abs(test[0]))
     found, worst = [], 0.0
     for rank, (deviations, place) in enumerate(tests):
@@ -140,3 +142,22 @@ def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tupl
             quantity, _, wheel = problem.gain_names[i].partition(".")
             gain = float(gaussian.gains[i])
             yield gain / math.sqrt(shift_variance), Disagreement(quantity, wheel, "gain", gain)
+
+
+def _parameter_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tuple[float, Disagreement]]:
+    """The same of the effects' parameters that recordings share.
+
+    One at the edge of its range has no posterior variance: its shift has at most that of the prior.
+    """
+    problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
+    by_name = {effect.name: effect for effect in fitted.effects}
+    for i, (prior, free) in enumerate(zip(fitted.free_unheld, fitted.free, strict=True), problem.n_sensors):
+        if prior.std == 0.0 or by_name[prior.effect].own_in_each_record(prior.parameter):
+            continue
+        u = float(gaussian.gains[i])
+        shift = free.at(u) - prior.value
+        shift_variance = 1.0 - float(gaussian.covariance[_SOIL + i, _SOIL + i]) if free.std > 0.0 else 1.0
+        if shift_variance > options.min_variance_share:
+            wheel = "" if prior.wheel is None else problem.rig.wheels[prior.wheel]
+            place = Disagreement(prior.effect, wheel, f"parameter {prior.parameter.name}", shift)
+            yield shift / prior.std / math.sqrt(shift_variance), place

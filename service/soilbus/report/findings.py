@@ -9,10 +9,11 @@ before and after, and the soil of each recording before and after.  The sentence
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from soilbus.config.model import Config
+from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms
 from soilbus.diagnosis.search import Addition
@@ -35,6 +36,7 @@ from soilbus.report.statement import (
 )
 from soilbus.report.table import AT_EDGE, table, value_text
 from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Effect
 
 MAX_PLACES = 8
 """Places of disagreement that the text lists."""
@@ -76,6 +78,7 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],
         "soils": soils,
+        "configured": {name: values_std(values) for name, values in diagnosis.base.prior_parameters().items()},
         "model": {name: values_std(values) for name, values in findings.diagnosis.completed.parameters().items()},
         "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
         "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
@@ -165,7 +168,7 @@ def findings_text(findings: Findings) -> str:
     diagnosis = findings.diagnosis
     lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
     lines += [f"  {line}" for line in place_lines(findings)]
-    lines += shown_lines(diagnosis, findings.config)
+    lines += [*configured_lines(diagnosis), *shown_lines(diagnosis, findings.config)]
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
     if findings.plan is not None:
@@ -216,6 +219,9 @@ def size_text(place: Disagreement) -> str:
         return f"residuals {place.size:.2f} times the noise"
     if place.region == "gain":
         return f"an implausible gain error of {100 * place.size:+.2f} %"
+    if place.region.startswith("parameter "):
+        unit = _unit_of(place.region.removeprefix("parameter "), CATALOGUE[place.channel])
+        return f"fitted less configured {place.size:+.3g}{unit}"
     return f"reading less model {place.size:+.3g} {UNITS.get(place.channel, '')}".rstrip()
 
 
@@ -223,12 +229,8 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
     """One effect: its physics, parameters, alternatives, and what would distinguish it from these."""
     effect = addition.effect
     lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]
-    units = {parameter.name: parameter.unit for parameter in effect.parameters}
-    units |= {late.total: "s" for late in effect.late.values()}
     for name, estimate in completed.parameters()[effect.name].items():
-        unit = units.get(name) or units[name.rpartition("_")[0]]
-        size = value_text(estimate.value, estimate.std, AT_EDGE)
-        lines.append(f"   {name} = {size}" + ("" if unit == "1" else f" {unit}"))
+        lines.append(f"   {name} = {value_text(estimate.value, estimate.std, AT_EDGE)}{_unit_of(name, effect)}")
     lines += [f"   {line}" for line in filter(None, [same_push(addition, completed)])]
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
@@ -236,6 +238,29 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
         lines += ["   what would tell them apart:"]
         lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
     return lines
+
+
+def _unit_of(name: str, effect: Effect) -> str:
+    """The unit of a parameter, or of a wheel's own, to be written after its value."""
+    units = {parameter.name: parameter.unit for parameter in effect.parameters}
+    units |= {late.total: "s" for late in effect.late.values()}
+    unit = units.get(name) or units[name.rpartition("_")[0]]
+    return "" if unit == "1" else f" {unit}"
+
+
+def configured_lines(diagnosis: Diagnosis) -> Iterator[str]:
+    """The effects that the configuration gives and a fit moves: values there and as fitted."""
+    fitted = diagnosis.completed.parameters()
+    for effect in diagnosis.base.effects:
+        priors = diagnosis.base.prior_parameters()[effect.name]
+        found = [
+            f"{name} {value_text(prior.value, prior.std)}{unit}, fitted {value_text(one.value, one.std, AT_EDGE)}{unit}"
+            for name, prior in priors.items()
+            if prior.std > 0.0
+            for one, unit in [(fitted[effect.name][name], _unit_of(name, effect))]
+        ]
+        if found:
+            yield f"in the configuration, {effect.name}: {'; '.join(found)}"
 
 
 def residual_lines(descriptions: Sequence[ResidualTerms]) -> list[str]:
