@@ -28,8 +28,8 @@ from soilbus.terra.soils import soil_named
 CONFIG = reference_configuration()
 PLACE = Disagreement("draft", "", "slip 0.20..0.35", 312.0, significance=1e-5)
 SOIL = Posterior(soil_named("loam"), np.diag([0.3, 0.02, 0.01, 0.005, 0.1, 0.02]) ** 2)
-NOTHING = SimpleNamespace(fits=[SimpleNamespace(posterior=SOIL)], converged=True, at_limits=())
-OPEN_END = SimpleNamespace(fits=NOTHING.fits, converged=False, at_limits=())
+NOTHING = SimpleNamespace(fits=[SimpleNamespace(posterior=SOIL)], converged=True, at_limits=(), held={})
+OPEN_END = SimpleNamespace(fits=NOTHING.fits, converged=False, at_limits=(), held={})
 NAMES = sorted(CATALOGUE)
 
 
@@ -159,3 +159,16 @@ def test_names_beside_a_present_model_that_did_not_converge_are_no_finding():
 def test_a_gap_that_is_no_number_is_unknown_and_not_none(gap):
     assert verdict_of(gap, gap, 500, []) is Verdict.UNKNOWN
     assert verdict_of(2.0, gap, 500, [0.99]) is Verdict.UNKNOWN
+
+
+@pytest.mark.parametrize("names", [(), ("lugs",)])
+def test_what_the_configuration_holds_is_said_where_something_is_missing(names):
+    """A delay that the configuration holds is no candidate, so the catalogue may well explain what is missing."""
+    holds = SimpleNamespace(**(vars(NOTHING) | {"held": {"channel_lag": ["ground_speed_delay", "draft_delay"]}}))
+    gaps = Gap(2.6, 900), Gap(1.9, 900)
+    found = Diagnosis(Verdict.UNKNOWN, (), tuple(addition(n, 0.9) for n in names), holds, holds, (), *gaps)
+    assert "no effect that was tried explains" in statement(found)
+    assert "catalogue" not in statement(found) + headline(found)
+    assert "not tried: channel_lag (ground_speed_delay, draft_delay)" in (doubt(found) or "")
+    agreeing = Diagnosis(Verdict.NONE, (), (), holds, holds, (), Gap(1.0, 900), Gap(1.0, 900))
+    assert doubt(agreeing) is None

@@ -128,6 +128,7 @@ def test_an_effect_of_the_configuration_that_the_data_refute_is_a_place(refuted)
     (found,) = disagreements([record], base)
     assert (found.channel, found.region, found.size) == ("drivetrain_loss", "parameter share", -0.15)
     assert found.significance < 1e-6
+    assert base.held == {"drivetrain_loss": ["drag", "viscous", "fading"]}
 
 
 def test_an_effect_of_the_configuration_that_is_there_is_no_place():

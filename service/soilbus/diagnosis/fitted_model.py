@@ -134,6 +134,16 @@ class FittedModel:
         return tuple(f for f in of_edge if f.parameter.neutral == 0.0 and f.value != 0.0)
 
     @property
+    def held(self) -> dict[str, list[str]]:
+        """Parameters by effect that the prior holds; without those that it cannot free, each recording's own."""
+        by_name, out = {effect.name: effect for effect in self.effects}, dict[str, list[str]]()
+        for f in self.free_unheld:
+            names = out.setdefault(f.effect, [])
+            if f.std == 0.0 and f.parameter.name not in names and not by_name[f.effect].own_in_each_record(f.parameter):
+                names.append(f.parameter.name)
+        return {effect: names for effect, names in out.items() if names}
+
+    @property
     def neg2_log_evidence(self) -> float:
         """-2 log of the marginal likelihood of all data, up to a constant.
 

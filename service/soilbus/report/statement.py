@@ -37,7 +37,7 @@ def is_open(diagnosis: Diagnosis) -> bool:
 def statement(diagnosis: Diagnosis) -> str:
     """One line: what was found, and whether a gap remains."""
     names = [addition.effect.name for addition in diagnosis.additions]
-    text, gap = _found(diagnosis.verdict, names, disagrees(diagnosis)), diagnosis.gap_after
+    text, gap = _found(diagnosis, names), diagnosis.gap_after
     if diagnosis.verdict is Verdict.UNKNOWN or not is_open(diagnosis):
         return text
     left = "; something is left besides" if names else ""
@@ -61,7 +61,8 @@ def headline(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict is Verdict.NONE:
         return "No effect is found missing" if disagrees(diagnosis) else "Model and data agree"
     if diagnosis.verdict is Verdict.UNKNOWN:
-        return " and ".join(["Missing: something that the catalogue does not have", *names])
+        what = "that no effect tried explains" if diagnosis.base.held else "that the catalogue does not have"
+        return " and ".join([f"Missing: something {what}", *names])
     return f"Missing from the model: {' and '.join(names)}"
 
 
@@ -98,10 +99,10 @@ def to_tell_apart(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
         yield "What these recordings could not show, and what would:", [f"{e.name}: {e.tells}" for e in hidden]
 
 
-def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
-    several = len(names) > 1
+def _found(diagnosis: Diagnosis, names: Sequence[str]) -> str:
+    verdict, several = diagnosis.verdict, len(names) > 1
     if verdict is Verdict.NONE:
-        if disagree:
+        if disagrees(diagnosis):
             return "no effect explains enough to be added, though model and data disagree by more than noise"
         return "model and data agree: nothing is missing that these recordings could have shown"
     if verdict is Verdict.NAMED:
@@ -113,10 +114,11 @@ def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
     if verdict is Verdict.AMBIGUOUS:
         who = "effects are missing" if several else "an effect is missing"
         return f"{who}, and the data do not tell for sure which"
+    none = "no effect that was tried" if diagnosis.base.held else "no effect of the catalogue"
     if not names:
-        return "something is missing that no effect of the catalogue explains"
+        return f"something is missing that {none} explains"
     there = f"{', '.join(names[:-1])} and {names[-1]} are" if several else f"{names[0]} is"
-    return f"{there} there, as far as the data tell, and more is missing that no effect of the catalogue explains"
+    return f"{there} there, as far as the data tell, and more is missing that {none} explains"
 
 
 def no_places(diagnosis: Diagnosis) -> str:
@@ -129,8 +131,11 @@ def no_places(diagnosis: Diagnosis) -> str:
 
 
 def doubt(diagnosis: Diagnosis) -> str | None:
-    """Why the names are doubtful: open fits, sizes at an edge, effects that explain the data only together; or None."""
-    reasons = _not_converged(diagnosis), _at_limits(diagnosis), _imitation(diagnosis)
+    """Why the finding is doubtful, or None.
+
+    Open fits, sizes at an edge, effects that explain the data only together, effects that were not tried.
+    """
+    reasons = _not_converged(diagnosis), _at_limits(diagnosis), _imitation(diagnosis), _held(diagnosis)
     found = [text for text in reasons if text is not None]
     return "to be doubted: " + "; ".join(found) if found else None
 
@@ -170,6 +175,15 @@ def _imitation(diagnosis: Diagnosis) -> str | None:
     if any(addition.effect.of_tyre for addition in diagnosis.additions):
         text += ' (say tyre = "rigid" of such wheels)'
     return text
+
+
+def _held(diagnosis: Diagnosis) -> str | None:
+    """What the configuration holds is no candidate: where something is missing it may be that."""
+    held = diagnosis.base.held
+    if not held or not (diagnosis.additions or diagnosis.verdict is not Verdict.NONE or disagrees(diagnosis)):
+        return None
+    parts = ", ".join(f"{effect} ({', '.join(names)})" for effect, names in held.items())
+    return f"held by the configuration and so not tried: {parts}; a std beside a value, {{ value, std }}, frees it"
 
 
 def same_push(addition: Addition, completed: FittedModel) -> str | None:
