@@ -141,6 +141,7 @@ def test_what_could_not_be_shown_is_reported_with_what_it_does_to_the_soil():
     assert "could have shown, from about these sizes on: torque_lag 0.04 s, multipass 0.03" in text
     assert "could not have shown, at any usual size: slip_sinkage" in text
     std = SOIL.bearing_pressure(0.02, 0.3)
+    assert text.splitlines()[-1].startswith("what they could not have shown may move")
     assert f"its +- {100.0 * std.std / std.value:.1f} %: slip_sinkage 1 by -20.0 %" in text
     assert "torque_lag" not in text.splitlines()[-1]
     assert "multipass" not in text.splitlines()[-1]
@@ -172,3 +173,12 @@ def test_what_the_configuration_holds_is_said_where_something_is_missing(names):
     assert "not tried: channel_lag (ground_speed_delay, draft_delay)" in (doubt(found) or "")
     agreeing = Diagnosis(Verdict.NONE, (), (), holds, holds, (), Gap(1.0, 900), Gap(1.0, 900))
     assert doubt(agreeing) is None
+
+
+def test_sizes_that_would_have_shown_are_not_said_to_be_unseen():
+    """What is shown from 0.98 on may move the soil where it is just below that."""
+    found = Diagnosis(Verdict.NONE, (), (), NOTHING, NOTHING, (), Gap(1.0, 900), Gap(1.0, 900), ())
+    near = dataclasses.replace(found, detectable=(shown("multipass", 0.98, 1.1),))
+    assert list(shown_lines(near, CONFIG))[-1].startswith("sizes just below these may move")
+    both = dataclasses.replace(found, detectable=(*near.detectable, shown("slip_sinkage", None, -0.2)))
+    assert list(shown_lines(both, CONFIG))[-1].startswith("sizes just below these and what they could not have shown")

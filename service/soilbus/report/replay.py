@@ -77,7 +77,12 @@ def headline(results: Sequence[WindowResult], config: Config) -> str:
     states = Counter(r.traversability.state for r in results)
     if states[State.UNKNOWN] == len(results):
         what = "windows" if config.table is None else "runs"
-        return f"The soil is known in {len(known)} of {len(results)} {what}"
+        valid = sum(r.status is Status.VALID for r in results)
+        if valid:
+            return f"The soil is known in {valid} of {len(results)} {what}"
+        (status, reason), group = by_reason(results)[0]
+        of = f"{len(group)} are {status}: {reason}"
+        return f"The soil is known in none of {len(results)} {what}, doubtful in {len(known)}; {of}"
     (name, n), *others = [(look.name, states[state]) for state, look in STATES.items() if states[state]]
     return ", ".join([f"{name} in {n} of {len(results)} windows", *(f"{name} in {n}" for name, n in others)])
 

@@ -27,6 +27,7 @@ from soilbus.terra.vehicle import GRAVITY
 
 MAX_UNSEEN = 3
 """Effects that may be there unseen that the text lists."""
+UNSEEN = "what they could not have shown"
 
 
 def is_open(diagnosis: Diagnosis) -> bool:
@@ -255,7 +256,9 @@ def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
     if unseen:
         parts = [f"{size_of(found, found.unseen)} by {100.0 * error:+.1f} %" for found, error, _ in unseen[:MAX_UNSEEN]]
         more = f" (and {len(unseen) - MAX_UNSEEN} more by less)" if len(unseen) > MAX_UNSEEN else ""
+        seen = {found.size is not None for found, _, _ in unseen}
+        what = [text for is_seen, text in ((True, "sizes just below these"), (False, UNSEEN)) if is_seen in seen]
         yield (
-            "what they could not have shown may move the bearing pressure by more than its "
+            f"{' and '.join(what)} may move the bearing pressure by more than its "
             f"+- {100.0 * unseen[0][2]:.1f} %: {', '.join(parts)}{more}"
         )
