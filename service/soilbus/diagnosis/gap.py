@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.arrays import Array
+from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck, fit_model
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import gap_limit
@@ -90,14 +91,27 @@ def _misfit(fitted: FittedModel) -> _Misfit:
     """Of the fold that a model's records hold out."""
     excess, degrees = 0.0, 0.0
     for check, fit in zip(fitted.checks, fitted.fits, strict=True):
-        problem, at = check.problem, check.at
-        expected = problem.expected_chi2(at, fit.mode.gains)
-        excess += check.chi2 - expected
-        degrees += expected
-        if problem.computes_sides and problem.common_weights is not None:
-            r, R = at.rows[:, RESIDUAL].reshape(problem.n, -1), problem.common_weights
-            degrees += float(np.einsum("ni,nij,nj->", r, R, r)) - at.chi2  # E[chi2] = chi2 - r' R r + tr(R C)
+        missed, expected = _excess_and_degrees(check, fit.mode.gains)
+        excess, degrees = excess + missed, degrees + expected
     return _Misfit(excess, fitted.checked_rows, degrees)
+
+
+def _excess_and_degrees(check: HeldOutCheck, gains: Array) -> tuple[float, float]:
+    """chi-square - E[chi-square] and tr(R C) of the held-out blocks of one recording.
+
+    The chi-square has besides the noise what the fit leaves uncertain, r' S^-1 r has not; where loads are computed,
+    weights that all models share take the place of S^-1.
+    """
+    problem, at = check.problem, check.at
+    R, K = problem.common_weights, problem.held_covariance
+    if R is None or K is None:
+        expected = problem.expected_chi2(at, gains)
+        return check.chi2 - expected, expected
+    r = at.rows[:, RESIDUAL].reshape(R.shape[:2])
+    S = np.linalg.inv(problem.inverse_covariance(at.by_latents, *problem.variances(gains)))
+    unknown = r.size - check.rows  # rows without a measurement, of weight and variance 1
+    degrees = float(np.sum(R * (S - K))) - unknown
+    return check.chi2 - at.chi2 + float(np.einsum("ni,nij,nj->", r, R, r)) - degrees, degrees
 
 
 def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> Gap:
