@@ -32,19 +32,6 @@ def test_a_slow_ground_speed_lies_on_the_line_between_its_samples_and_is_worth_n
     assert 0.75 * len(t) < worth <= len(t) * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("period", [0.05, 0.06, 0.07])
-def test_a_channel_a_little_slower_than_the_bins_leaves_none_empty(period):
-    t, window = stored(period)
-    inside = (window.t > t[0]) & (window.t < t[-1])
-    assert np.isfinite(window.ground_speed[inside]).all()
-    assert window.ground_speed[inside] == pytest.approx(1.0 + 0.1 * window.t[inside], abs=1e-12)
-
-
-def test_lost_bins_of_a_fast_channel_stay_empty():
-    _, window = stored(0.02, lost=[50, 51, 120, 121])
-    assert np.isnan(window.ground_speed).sum() == 2
-
-
 def test_where_a_sample_is_lost_nothing_is_put_in_its_place():
     _, whole = stored(0.1)
     _, window = stored(0.1, lost=[20])

@@ -285,7 +285,7 @@ def watched(
     Returns
     -------
     Watch
-        Its warning is unknown until the trends are `long_memory` old.
+        Its warning is unknown until the trends are `settling_time` old.
 
     Notes
     -----
@@ -321,7 +321,7 @@ def watched(
     total = pull + reserve
     share, rise = (min(look.asked, pull) / total, rising.slope / total) if total > 0.0 else (0.0, 0.0)
     time_left = None
-    if t - before.since >= options.long_memory:
+    if t - before.since >= options.settling_time:
         time_left = 0.0
         if reserve > 0.0:
             time_left = _time_of_creep(creeping, float(curve.slip[-1]), giving.slope / total, options)

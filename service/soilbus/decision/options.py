@@ -22,10 +22,11 @@ class WatchOptions:
     3 Hz.  With 0.12 s one bogging less was warned of in time on two of three machines (122 boggings, seed 71)."""
     slip_exponent: float = 7.5
     """b [1]: gross traction ratio mu = mu_max (1 - e^(-b s)) over slip s (Brixius 1987, tyres in fields)."""
+    settling_time: float = 2.0
+    """Age [s] of a trend from which it is used."""
 
     long_memory: float = 2.5
-    """Time constant [s] of forgetting a capacity: of ground that softens over many metres.  Younger trends warn of
-    nothing."""
+    """Time constant [s] of forgetting a capacity: of ground that softens over many metres."""
     short_memory: float = 0.8
     """Time constant [s] of forgetting a capacity: of a soft patch's edge."""
     scatter_memory: float = 10.0

@@ -9,7 +9,6 @@ a sample is nan, unless it lies between samples of a channel of the vehicle that
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -180,8 +179,7 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     -----
     For channels of the vehicle only, whose mass lets them change slowly.  What a wheel does swings with its load at
     1.5 to 3 Hz, so a wheel's bin holds what was measured in it or nothing.  One lost sample doubles the gap, so a gap
-    of more than one and a half times the channel's usual one (the median of ten gaps in a row, over ten and rounded up
-    to whole bins) stays empty.
+    of more than one and a half times the channel's usual one stays empty.
     """
     filled = count > 0.0
     n_filled = filled.sum(0)
@@ -192,8 +190,9 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     for channel in slow:
         at = np.flatnonzero(filled[:, channel])
         step = np.diff(at)
-        gaps = min(10, len(step))
-        usual = math.ceil(np.median(at[gaps:] - at[:-gaps]) / gaps)
+        usual = np.median(step)
+        if usual < 2.0:
+            continue
         step = np.where(step <= 1.5 * usual, step, 1)
         between = np.concatenate([np.arange(i + 1, i + n) for i, n in zip(at, step, strict=False)])
         mean[between, channel] = np.interp(centre[between], since[at, channel], mean[at, channel])
