@@ -252,7 +252,7 @@ def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was
         found = diagnose_logs(rig(), paths).diagnosis
         assert found.verdict is verdict
         assert [a.effect.name for a in found.additions] == [a.effect.name for a in active]
-    assert found.base.gap > 2.0 > 1.6 > found.completed.gap
+    assert found.base.held_out_chi2 > 2.0 > 1.6 > found.completed.held_out_chi2
 
 
 def test_six_rows_with_nothing_missing_show_no_gap():
@@ -268,7 +268,7 @@ def test_six_rows_with_nothing_missing_show_no_gap():
             continue
         values = {"wheel_load": rows["load"], "slip": rows["slip"], "drawbar_pull": rows["pull"]}
         window = window_of_rows(the_rig, np.arange(6.0), values | {"torque": rows["torque"], "sinkage": rows["sink"]})
-        gaps.append(fit_model([record_of_rows("", window, the_rig, model)], prior, ()).gap)
+        gaps.append(fit_model([record_of_rows("", window, the_rig, model)], prior, ()).held_out_chi2)
     assert np.mean(gaps) == pytest.approx(1.0, abs=0.35)  # 25 times 6 residuals: sd 0.12, and the model is not linear
     assert np.mean(np.array(gaps) > gap_limit(6)) <= 0.08
 

@@ -28,7 +28,7 @@ def wandering(rate: float, seed: int):
 def test_each_recording_has_a_wander_of_its_own():
     records = [wandering(6.0, 3), wandering(-6.0, 4)]
     found = fit_model(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
-    assert found.gap < 1.1
+    assert found.held_out_chi2 < 1.1
     first, second = (found.fits[i].mode.gains[found.checks[i].problem.n_sensors :] for i in range(2))
     drift = [f.parameter.name for f in found.free].index("drift")
     std = found.free[drift].std

@@ -47,7 +47,7 @@ def test_the_gap_is_that_of_fits_to_each_choice_of_blocks(record, effects):
     fits = [fit_model([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(FOLDS)]
     rows = [fit.checked_rows for fit in fits]
     assert reported.rows == sum(rows)
-    expected = sum(fit.gap * n for fit, n in zip(fits, rows, strict=True)) / sum(rows)
+    expected = sum(fit.held_out_chi2 * n for fit, n in zip(fits, rows, strict=True)) / sum(rows)
     assert reported.value == pytest.approx(expected, abs=2e-3)
     assert abs(reported.value - 1.0) < 4.0 * math.sqrt(2.0 / reported.rows) or not effects
 
@@ -65,7 +65,7 @@ def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
     """Tables, a model that did not converge, and a gap that a third of the blocks shows well enough."""
     found = fit_model([record], PRIOR, ())
     alone = gap_of_fold(found)
-    assert alone[:2] == pytest.approx((found.gap, found.checked_rows))
+    assert alone[:2] == pytest.approx((found.held_out_chi2, found.checked_rows))
     assert gap_of([replace(record, whole=None, fold=None)], PRIOR, found) == alone
     creeping = replace(found, fits=tuple(replace(fit, termination=Termination.LIMIT) for fit in found.fits))
     assert gap_of([record], PRIOR, creeping) == alone
@@ -103,7 +103,7 @@ def test_a_model_far_off_does_not_hide_in_its_own_weights():
     made = simulate(config, excited("loam", SECONDS), 4, (lag,))
     _, fitted = weighed(record_of_recording("drive", made, config))
     found = gap_of_fold(fitted)
-    assert fitted.gap < 1.5
+    assert fitted.held_out_chi2 < 1.5
     assert found.value > 2.0 > found.limit()
 
 

@@ -56,7 +56,7 @@ def test_both_wheels_of_ding_dig_in_as_they_slip(ding, wheel, errors):
     assert first.effect.name == "slip_sinkage"
     others = max((fall for name, fall in first.falls.items() if name != "slip_sinkage"), default=0.0)
     assert first.falls["slip_sinkage"] > (1.3 if errors == 1 else 1.0) * others
-    assert found.completed.gap - 1.0 < 0.5 * (found.base.gap - 1.0)
+    assert found.completed.held_out_chi2 - 1.0 < 0.5 * (found.base.held_out_chi2 - 1.0)
     assert found.completed.parameters()["slip_sinkage"]["exponent"].value == pytest.approx(0.7, abs=0.3)
 
 
@@ -96,7 +96,7 @@ def test_lugs_explain_the_lugged_wheel_better_than_another_shape_of_the_stress_b
 def test_points_without_torque_are_diagnosed(points):
     found = diagnosed("rashid1", "lugged", 2, points)
     assert found.base.rows == 10  # five pulls and five sinkages
-    assert found.base.gap > gap_limit(found.base.checked_rows)
+    assert found.base.held_out_chi2 > gap_limit(found.base.checked_rows)
     assert found.verdict is not Verdict.NONE
 
 

@@ -33,7 +33,7 @@ class Recordings:
             neg2_log_evidence=value,
             neg2_log_posterior=value,
             excess=ROWS * (self.gap - 1.0),
-            gap=self.gap,
+            held_out_chi2=self.gap,
             checked_rows=ROWS // 3,
             rows=ROWS,
             as_starts=lambda effects=None: (),

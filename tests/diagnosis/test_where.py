@@ -98,7 +98,10 @@ def test_significances_are_of_all_tests_together_and_the_clearest_comes_first():
 
 def test_regions_of_an_axles_torque_are_of_its_own_wheels():
     """The rear motor reads too much at great slip of the rear wheels; the front right one has slips of its own."""
-    error = lambda t, slip, speed: np.where(slip > 0.25, 1500.0, 0.0)  # noqa: E731
+
+    def error(t, slip, speed):
+        return np.where(slip > 0.25, 1500.0, 0.0)
+
     record = recorded("loam", 60.0, 3, "torque.rear", error, rig_of(AXLES), AXLES)
     base = fit_model([record], prior_of(AXLES), ())
     assert base is not None
@@ -111,7 +114,9 @@ def test_regions_of_an_axles_torque_are_of_its_own_wheels():
 
 
 def test_a_place_names_its_recording():
-    error = lambda t, slip, speed: 250.0 * (t > 40.0)  # noqa: E731
+    def error(t, slip, speed):
+        return 250.0 * (t > 40.0)
+
     records = [
         dataclasses.replace(recorded("loam", 60.0, seed, channel, error if channel else None), name=name)
         for seed, channel, name in ((4, "", "sound.log"), (3, "torque.RL", "late.log"))

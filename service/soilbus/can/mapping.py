@@ -199,10 +199,6 @@ def _find_signal(message: Message, name: str) -> Signal:
         raise _Fault(str(error)) from None
 
 
-USUALLY_VALID = 1
-"""Code that vouches where neither the configuration nor a value table says which."""
-
-
 def _validity(message: Message, mapped: Mapped) -> tuple[str | None, tuple[int, ...]]:
     """Name of the signal that vouches for the mapped one, and its codes that do; a fault when they never could."""
     if mapped.valid is None:
@@ -215,7 +211,7 @@ def _validity(message: Message, mapped: Mapped) -> tuple[str | None, tuple[int, 
         raise _Fault(f"valid = {mapped.valid} is a float; it must be a code")
     codes = mapped.valid_values
     if codes is None:
-        codes = list(vouching_codes(signal)) or [USUALLY_VALID]
+        codes = list(vouching_codes(signal)) or [1]
     low, high = code_limits(signal)
     if not any(low <= code <= high for code in codes):
         raise _Fault(f"valid_values {codes} never occur in {mapped.valid}, which has {low}..{high}")

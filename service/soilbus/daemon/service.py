@@ -37,7 +37,7 @@ from soilbus.decision.immobilisation import Alert, Watch, ended, has_cause, watc
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
-from soilbus.pipeline.corrections import Corrections
+from soilbus.pipeline.corrections import NO_CORRECTIONS
 from soilbus.pipeline.intake import Latest
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.pipeline import Pipeline
@@ -460,7 +460,7 @@ class Service:
         return self.result.traversability.since_valid + max(self._present_time(now) - self.result.t, 0.0)
 
     def _publish_ten_hertz(self, now: float) -> None:
-        corrections = Corrections() if self._last is None else self._last.corrections
+        corrections = NO_CORRECTIONS if self._last is None else self._last.corrections
         latest = self.intake.latest(self._time.at(now), corrections) if self.bus.is_open else Latest({}, None)
         if latest.motion is not None:
             self._loss = observed(self._loss, latest.motion, self.config)

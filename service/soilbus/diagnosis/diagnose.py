@@ -147,7 +147,9 @@ def diagnose(
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
         present = with_delays(records, prior, present, temperature(present.excess, options))
-    if not present.converged and not present.gap < base.gap:  # such an end has no evidence, and predicts worse
+    if (
+        not present.converged and not present.held_out_chi2 < base.held_out_chi2
+    ):  # such an end has no evidence, and predicts worse
         additions, present = [], base
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")

@@ -7,8 +7,8 @@ belongs to a recording, and so do the parameters of an effect of the record (see
 are fitted one after the other, each with the posterior of the previous ones as its prior, and then in turn again, each
 with the likelihood factors of all others in its prior, until all are at the same shared values: the optimum of all
 recordings together, in any order (expectation propagation by Laplace's method: Minka 2001, Proc. UAI 17:362).
-FittedModel.gap, the reduced chi-square of the held-out blocks, says how well the model predicts data that it was not
-fitted to; `gap` compares it with what the sensors' noise alone leaves.
+FittedModel.held_out_chi2, the reduced chi-square of the held-out blocks, says how well the model predicts data that it
+was not fitted to; `gap` compares it with what the sensors' noise alone leaves.
 """
 
 from __future__ import annotations
@@ -166,10 +166,10 @@ class FittedModel:
     @property
     def excess(self) -> float:
         """By how much the squared residuals of all blocks, in units of their variance, exceed what noise leaves."""
-        return self.neg2_log_posterior + self.gap * self.checked_rows - self.expected_chi2
+        return self.neg2_log_posterior + self.held_out_chi2 * self.checked_rows - self.expected_chi2
 
     @property
-    def gap(self) -> float:
+    def held_out_chi2(self) -> float:
         """Reduced chi-square of the held-out blocks, by the covariance that has what computed loads leave open too."""
         return sum(check.chi2 for check in self.checks) / max(self.checked_rows, 1)
 

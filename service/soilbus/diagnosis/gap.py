@@ -122,7 +122,7 @@ def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> 
     """
     options, of_folds = records[0].options, _misfit(fitted)
     one_fold = of_folds.gap
-    if not fitted.converged or fitted.gap > options.max_cross_validated:
+    if not fitted.converged or fitted.held_out_chi2 > options.max_cross_validated:
         return one_fold
     for fold in range(options.folds - 1):
         divided = [record.with_held_out(fold) for record in records]
@@ -131,7 +131,7 @@ def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> 
             return one_fold
         starts = [_start(record, fold, start) for record, start in zip(records, fitted.as_starts(), strict=True)]
         refitted = fit_model(parts, prior, fitted.effects, starts)
-        if refitted is None or not math.isfinite(refitted.gap):
+        if refitted is None or not math.isfinite(refitted.held_out_chi2):
             return one_fold
         of_folds += _misfit(refitted)
     return of_folds.gap

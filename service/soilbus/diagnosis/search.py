@@ -275,7 +275,9 @@ def required_fall_beside(
     of that (a sixth of the excess in drives whose loads shake by 12 %).
     """
     left = model.excess if any(record.training.computes_sides for record in records) else None
-    return required_fall(divisor, model.gap, model.checked_rows, model.rows, options, left, excess - model.excess)
+    return required_fall(
+        divisor, model.held_out_chi2, model.checked_rows, model.rows, options, left, excess - model.excess
+    )
 
 
 class FitCache:

@@ -17,7 +17,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 
-__all__ = ["Corrections"]
+__all__ = ["NO_CORRECTIONS", "Corrections"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,3 +58,7 @@ class Corrections:
             duration=float(t[-1, 0]),
         )
         return replace(window, draft=true_draft(self.effects, window.draft, measured))
+
+
+NO_CORRECTIONS = Corrections()
+"""Before the first window."""

@@ -38,7 +38,7 @@ from soilbus.estimation.window import (
     pull_given,
     steady,
 )
-from soilbus.pipeline.corrections import Corrections
+from soilbus.pipeline.corrections import NO_CORRECTIONS, Corrections
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import SensorConsistency, without
@@ -417,7 +417,7 @@ class Intake:
             if c.name in self._last_refused and now - self._last_refused[c.name][0] <= self._timeout(c)
         }
 
-    def latest(self, now: float, corrections: Corrections = Corrections()) -> Latest:  # noqa: B008, immutable
+    def latest(self, now: float, corrections: Corrections = NO_CORRECTIONS) -> Latest:
         """Slip, pull, motion, draft and pitch over the last `moment_span` before `now` [s].
 
         corrections: of the last window.  Pitch and acceleration may be as old as the time-out of a channel.

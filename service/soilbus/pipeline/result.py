@@ -15,7 +15,7 @@ from soilbus.decision.immobilisation import Warnings, Watch
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import Status, Traversability
-from soilbus.pipeline.corrections import Corrections
+from soilbus.pipeline.corrections import NO_CORRECTIONS, Corrections
 from soilbus.pipeline.determination import Excitation
 from soilbus.pipeline.positions import Position
 
@@ -125,7 +125,7 @@ class WindowResult:
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
     shows_strength: bool = False
-    corrections: Corrections = Corrections()  # noqa: RUF009, immutable
+    corrections: Corrections = NO_CORRECTIONS
 
     @property
     def curve(self) -> OverSlip | None:

@@ -25,4 +25,4 @@ def bound(case: Case) -> float | None:
     if not record.training.computes_loads:
         return None
     fitted = FitCache([record], prior_of(case.config), record.options).fit(record.training.effects)
-    return None if fitted is None else fitted.neg2_log_posterior + fitted.gap * fitted.checked_rows
+    return None if fitted is None else fitted.neg2_log_posterior + fitted.held_out_chi2 * fitted.checked_rows

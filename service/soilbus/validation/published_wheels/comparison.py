@@ -156,7 +156,7 @@ def _row(case: Case) -> tuple[str, ...]:
         case.wheel,
         case.soil,
         f"x{case.errors:g}",
-        f"{base.gap:.1f} -> {found.completed.gap:.1f}",
+        f"{base.held_out_chi2:.1f} -> {found.completed.held_out_chi2:.1f}",
         f"{gap_limit(base.checked_rows):.1f}",
         f"{strain(base):.1f} -> {strain(found.completed):.1f}",
         str(found.verdict),
