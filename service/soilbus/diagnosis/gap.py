@@ -2,11 +2,12 @@
 
     gap = 1 + sum over folds of (chi-square - E[chi-square]) / sum over folds of tr(R C)
 
-With load cells expected chi-square and trace are the number of residuals: reduced chi-square.  The covariance S = C + K
-of computed loads has also what these leave open, K, so that the sensors' noise C alone leaves less: tr(R C), with the
-weights R that all models share (`ObservationModel.expected_chi2`).  Loads that shake as `noise.computed_load` says
-bring the gap to rows / tr(R C) (`Gap.open_loads`): no cell says whether they do.  Eigenvalues of R C are at most 1, so
-noise gives the gap a sd of at most sqrt(2 / tr(R C)).
+With load cells E[chi-square] and tr(R C) are the number of residuals, and the gap is the reduced chi-square.  Where
+loads are computed, the residuals' covariance is C + K: C of the sensors' noise, K of what the loads leave open.  The
+sensors' noise alone then leaves a chi-square of tr(R C), less than the number of residuals; R are weights that all
+models share (`ObservationModel.expected_chi2`).  Loads that shake as `noise.computed_load` says bring the gap to the
+number of residuals over tr(R C) (`Gap.open_loads`), but no cell says whether they shake.  Eigenvalues of R C are at
+most 1, so that noise gives the gap a sd of at most sqrt(2 / tr(R C)).
 
 The gap of the one fold that a diagnosis holds out has a noise of a few per cent, often a tenth of its excess over 1.
 So a model that was found is fitted once more with each other fold held out, from its optimum (cross-validation: Stone

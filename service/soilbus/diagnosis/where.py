@@ -145,9 +145,9 @@ def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tupl
 
 
 def _parameter_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tuple[float, Disagreement]]:
-    """The same of the effects' parameters that recordings share.
+    """Tests of the effects' parameters that recordings share against their priors, as of the gain errors.
 
-    One at the edge of its range has no posterior variance: its shift has at most that of the prior.
+    A parameter at the edge of its range has no posterior variance: its shift has at most the prior's.
     """
     problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
     by_name = {effect.name: effect for effect in fitted.effects}
