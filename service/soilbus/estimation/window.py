@@ -2,10 +2,10 @@
 
     mean_b = sum of samples / n,    var(mean_b) = (absolute^2 + (relative mean_b)^2 + (of_mean level)^2) / n
 
-Sensors have their own rates and phases.  Averaging over short bins brings them onto one time base and makes the
-noise small enough to be propagated through the model linearly.  A bin without an admitted sample holds nan: a
-missing value is never zero.  `forward` mirrors reversing, `steady` goes on between the samples of a slope, `turning` finds turns; `NoiseTable` holds
-the sensors' noise.
+Sensors have their own rates and phases.  Averaging over short bins brings them onto one time base and makes the noise
+small enough to be propagated through the model linearly.  A bin without an admitted sample holds nan: a missing value
+is never zero.  `forward` mirrors reversing, `steady` goes on between the samples of a slope, `turning` finds turns;
+`NoiseTable` holds the sensors' noise.
 """
 
 from __future__ import annotations
