@@ -38,15 +38,16 @@ def test_each_recording_has_a_wander_of_its_own():
     assert abs(offset.value - 300.0) < 3.0 * offset.std
 
 
-def test_what_each_recording_has_of_its_own_is_as_unknown_in_the_next_one_as_in_the_first():
-    """What is the vehicle's is better known then, and stays so."""
-    records = [wandering(8.0, 3), wandering(3.0, 4)]
-    found = fit_model(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
-    n = found.checks[0].problem.n_sensors
-    place = {f.parameter.name: 6 + n + i for i, f in enumerate(found.free)}
-    before = found.joint_prior[1]
-    row = before.covariance[place["drift"]]
-    assert row[place["drift"]] == abs(row).sum() == 1.0
-    assert before.gains[place["drift"] - 6] == 0.0
-    assert before.covariance[place["offset"], place["offset"]] < 0.5
-    assert before.gains[place["offset"] - 6] != 0.0
+def test_what_a_recording_has_of_its_own_says_nothing_of_another_one():
+    """What is the vehicle's is better known by both."""
+    prior, effects = prior_of(reference_configuration()), [CATALOGUE["draft_offset"]]
+    second = wandering(3.0, 4)
+    alone, up, down = (
+        fit_model([*first, second], prior, effects) for first in ([], [wandering(8.0, 3)], [wandering(-6.0, 3)])
+    )
+    place = alone.checks[0].problem.n_sensors + [f.parameter.name for f in alone.free].index("drift")
+    one, other = (found.fits[1].mode.gain(place) for found in (up, down))
+    assert abs(one.value - other.value) < 0.3 * one.std
+    assert up.fits[0].mode.gain(place).value - down.fits[0].mode.gain(place).value > 10.0 * one.std
+    before, after = (found.parameters()["draft_offset"]["offset"].std for found in (alone, up))
+    assert after < 0.9 * before

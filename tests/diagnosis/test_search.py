@@ -66,7 +66,7 @@ def test_the_predicted_fall_is_the_greatest_that_the_ranges_of_the_parameters_al
         free = parameters_of(effect, len(record.training.rig.wheels))
         if len(free) > 4:  # three to this power are the faces
             continue
-        (equations,) = normal_equations([record], PRIOR, base, [effect], free)
+        equations = normal_equations([record], PRIOR, base, [effect], free).reduced(np.arange(len(free)))
         information = equations.information + np.eye(len(free))
         low, high = (
             np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high")

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
+from soilbus.diagnosis.joint_fit import Start, fit_jointly
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import Start, fit_from, fit_from_soil, fit_window
+from soilbus.estimation.multistart import fit_from_soil, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
@@ -45,7 +46,7 @@ class OneResidual:
         if not math.isfinite(r):
             return None
         none = np.zeros((1, 1))
-        return QuadraticModel(np.array([[slope**2]]), none, none, np.array([slope * r]), r**2, np.zeros((0, 1)), None)
+        return QuadraticModel(np.array([[slope**2]]), none, none, np.array([slope * r]), r**2, np.zeros((0, 1)))
 
     def stepped(self, iterate, model, step):
         return replace(iterate, soil=iterate.soil + step)
@@ -136,9 +137,7 @@ def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_o
     rng = np.random.default_rng(seed)
     root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)
     none = np.zeros((4, 4))
-    model = QuadraticModel(
-        root.T @ root, none, none, root.T @ target, 0.0, np.diag(sides)[np.array(sides) != 0.0], None
-    )
+    model = QuadraticModel(root.T @ root, none, none, root.T @ target, 0.0, np.diag(sides)[np.array(sides) != 0.0])
     step = model.step()
     assert np.all(step * np.array(sides) <= 1e-12)
     value = float(np.sum((root @ step + target) ** 2))
@@ -197,7 +196,8 @@ def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     problem, prior = bulldozed
     joint_prior = Gaussian.of(prior, problem.gain_std)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
-    fit = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains), SolverOptions())
+    start, own = Start(np.asarray(SOILS["loam"]), gains), np.zeros(len(gains), bool)
+    (fit,) = fit_jointly([problem], prior, [joint_prior], own, [start], SolverOptions())
     assert fit.converged
     low, high = problem.gain_bounds
     assert np.all(fit.mode.gains >= low - 1e-9)

@@ -22,10 +22,11 @@ from scipy.special import softmax
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.joint_fit import JointObjective, Start, own_gains
 from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import Fit, Start
+from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import inverse_covariance
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -138,11 +139,11 @@ def _posterior(
     """The posterior of the parameters at two indices (dead time, time constant)."""
     first, second = (fitted.free_unheld[i] for i in at)
     here = tuple(fitted.free[i].at(_standardised(fitted, i)) for i in at)
-    profiles = [_RecordProfile(record, prior, fitted, i, at) for i, record in enumerate(records)]
+    profile = _Profile([_RecordProfile(record, prior, fitted, i, at) for i, record in enumerate(records)], fitted)
 
     def cost(delay: float, tau: float) -> float:
         of_prior = first.standardised(delay) ** 2 + second.standardised(tau) ** 2
-        return of_prior + sum(profile.cost(delay, tau) for profile in profiles) / divisor
+        return of_prior + profile.cost(delay, tau) / divisor
 
     options, low, high = records[0].options, first.parameter.low, first.parameter.high
     most = min(second.parameter.high, max(sum(here) - low, options.delay_step) + 2.0 * options.delay_step)
@@ -232,10 +233,7 @@ def _best_sum(
 
 
 class _RecordProfile:
-    """-2 log posterior of one recording over the lateness of one channel, minimised over all else.
-
-    All else is linear about the fit.
-    """
+    """-2 log posterior of one recording over the lateness of one channel; all else is linear about the fit."""
 
     def __init__(self, record: Record, prior: SoilPrior, fitted: FittedModel, i: int, at: tuple[int, int]) -> None:
         self.fit: Fit = fitted.fits[i]
@@ -243,17 +241,17 @@ class _RecordProfile:
         self.problem = record.training.with_effects(fitted.effects, free)
         self.columns = [self.problem.n_sensors + k for k in at]
         self.free = [free[k] for k in at]
-        joint_prior = _with_held(fitted.joint_prior[i], self.columns)
+        joint_prior = _with_held(fitted.priors[i], self.columns)
         self.gains = self.fit.optimum.gains.copy()
         for f, k, column in zip(self.free, at, self.columns, strict=True):
             self.gains[column] = f.standardised(fitted.free[k].at(float(self.gains[column])))
         optimum = self.fit.optimum
-        objective = Objective(self.problem, prior, joint_prior)
+        self.objective = Objective(self.problem, prior, joint_prior)
         iterate = Iterate(optimum.soil, self.gains, optimum.latents)
-        quadratic = objective.quadratic_model(iterate)
+        quadratic = self.objective.quadratic_model(iterate)
         if quadratic is None:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")
-        self.quadratic, self.directions = quadratic, objective.directions(iterate)
+        self.quadratic, self.directions = quadratic, self.objective.directions(iterate)
         variance, row_var = self.problem.variances(self.gains)
         self.inverse = inverse_covariance(quadratic.linearisation.by_latents, variance, row_var)
         self.torque = self.problem.torques(optimum.soil, self.gains, optimum.latents)
@@ -270,19 +268,31 @@ class _RecordProfile:
         late = self.alone.delay_terms(gains, self.fit.optimum.latents, self.torque)
         return self.alone.delay_residuals(late, self.quadratic.linearisation.by_latents, gains)
 
-    def cost(self, delay: float, tau: float) -> float:
-        """-2 log posterior of this recording at a delay and a time constant [s], minimised over all else."""
+    def change(self, delay: float, tau: float) -> tuple[float, Array]:
+        """By how much a delay and a time constant [s] change -2 log posterior, and half its gradient, all else held."""
         change = self._residuals(delay, tau) - self.here
         weighed = (self.inverse @ change[:, :, None])[:, :, 0]
         at = self.quadratic.linearisation
-        gradient = self.quadratic.gradient + self.directions.T @ (at.rows.T @ weighed.ravel())
-        fall = gradient @ np.linalg.solve(self.quadratic.information, gradient)
-        return float(
-            self.quadratic.neg2_log_posterior
-            + 2.0 * at.weighed[:, 0] @ change.ravel()
-            + (change * weighed).sum()
-            - fall
-        )
+        rise = float(2.0 * at.weighed[:, 0] @ change.ravel() + (change * weighed).sum())
+        return rise, self.directions.T @ (at.rows.T @ weighed.ravel())
+
+
+class _Profile:
+    """-2 log posterior of all recordings over the lateness of one channel, minimised over all else."""
+
+    def __init__(self, parts: Sequence[_RecordProfile], fitted: FittedModel) -> None:
+        own = own_gains(parts[0].problem.n_sensors, fitted.effects, fitted.free)
+        self.parts, self.joint = parts, JointObjective([part.objective for part in parts], own)
+        self.model = self.joint.together([part.quadratic for part in parts])
+
+    def cost(self, delay: float, tau: float) -> float:
+        """-2 log posterior at a delay and a time constant [s], minimised over all else."""
+        cost, gradient = self.model.neg2_log_posterior, self.model.gradient.copy()
+        for part, columns in zip(self.parts, self.joint.columns, strict=True):
+            rise, change = part.change(delay, tau)
+            cost += rise
+            gradient[columns] += change
+        return cost - float(gradient @ np.linalg.solve(self.model.information, gradient))
 
 
 def _alone(free: Sequence[Free], at: tuple[int, int]) -> list[Free]:

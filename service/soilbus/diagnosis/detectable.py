@@ -24,14 +24,8 @@ from scipy.optimize import brentq
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import (
-    JointEquations,
-    NormalEquations,
-    joint_equations,
-    normal_equations,
-)
+from soilbus.diagnosis.score import NormalEquations, normal_equations
 from soilbus.diagnosis.search import excess_without_effects, required_fall_beside, temperature_beside
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import NORMAL_95, SoilPrior
@@ -78,45 +72,40 @@ def detectable(
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     free = [f for effect in candidates for f in parameters_of(effect, present.checks[0].problem.n_wheels)]
     equations = normal_equations(records, prior, present, candidates, free)
-    joint = joint_equations(equations)
     found = []
     for effect in candidates:
-        columns = [i for i, f in enumerate(free) if f.effect == effect.name]
         least = _sampling_delay(effect, records[-1])
-        own = [free[i] for i in columns]
-        found.append(_detectable(effect, columns, own, equations, joint, data_ratio, required, least, options))
+        found.append(_detectable(effect, free, equations, data_ratio, required, least))
     return tuple(found)
 
 
 def _detectable(
     effect: Effect,
-    columns: Sequence[int],
-    free: Sequence[Free],
-    equations: Sequence[NormalEquations],
-    joint: JointEquations,
+    all_free: Sequence[Free],
+    equations: NormalEquations,
     data_ratio: float,
     required: float,
     least: float,
-    options: DiagnosisOptions,
 ) -> Detectable:
-    parameter = effect.parameters[0]
+    parameter, recordings = effect.parameters[0], range(len(equations.iterates))
     most = _max_size(parameter)
-    block = np.ix_(columns, columns)
+    columns = np.array([i for i, f in enumerate(all_free) if f.effect == effect.name])
+    free = [all_free[i] for i in columns.tolist()]
+    parts = [equations.reduced(columns, i) for i in (recordings if effect.of_record else (0,))]
+    informations = [data_ratio * one.information for one in parts]
     if effect.of_record:  # in one recording, while the others pay for parameters that they do not need
-        informations = [data_ratio * one.information[block] for one in equations]
         unneeded = [_expected_change(information, np.zeros(len(free)), free) for information in informations]
         cases = [(one, required + sum(unneeded) - own) for one, own in zip(informations, unneeded, strict=True)]
     else:
-        cases = [(data_ratio * joint.information[block], required)]
+        cases = [(informations[0], required)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
     sizes = [min(_least_size(information, i, free, needed, most) for information, needed in cases) for i in first]
     size = max(*sizes, least)
     unseen = min(size, most)
     u = np.zeros(len(free))
     u[first[sizes.index(max(sizes))]] = unseen / parameter.std
-    by_u = [-one.response for one in equations] if effect.of_record else [by_u for _, by_u in joint.follow]
-    error = np.array([_soil_error(one, of_one[:, columns] @ u) for one, of_one in zip(equations, by_u, strict=True)])
-    return Detectable(effect, size if np.isfinite(size) else None, unseen, error)
+    error = [_soil_error(equations, i, parts[i if effect.of_record else 0].response @ u) for i in recordings]
+    return Detectable(effect, size if np.isfinite(size) else None, unseen, np.array(error))
 
 
 def _sampling_delay(effect: Effect, record: Record) -> float:
@@ -148,11 +137,11 @@ def _expected_change(information: Array, u: Array, free: Sequence[Free]) -> floa
     return mixture_neg2_log_evidence(information, information @ u, free)
 
 
-def _soil_error(equations: NormalEquations, follow: Array) -> Array:
-    """Error (6,) of the logarithms of the soil parameters, reported less true.
+def _soil_error(equations: NormalEquations, record: int, follow: Array) -> Array:
+    """Error (6,) of the logarithms of the soil parameters of a recording, reported less true.
 
-    follow (C,): by how much an effect moves the present model's coordinates, if it is in the model.
+    follow (n,): by how much an effect moves all coordinates, if it is in the model.
     """
-    objective = equations.objective
-    directions = objective.coordinates.log_directions(equations.iterate.soil)
-    return np.asarray(-directions @ follow[: len(objective.free)])
+    objective = equations.joint.parts[record]
+    directions = objective.coordinates.log_directions(equations.iterates[record].soil)
+    return np.asarray(-directions @ follow[equations.joint.columns[record]][: len(objective.free)])

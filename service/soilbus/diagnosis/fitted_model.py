@@ -3,12 +3,10 @@
     -2 log evidence = sum over recordings of [-2 log p(training blocks) - 2 log p(held-out blocks | training blocks)]
 
 Sensor gain errors and parameters of effects belong to the vehicle and are the same in all recordings.  The soil
-belongs to a recording, and so do the parameters of an effect of the record (see terra.effects.effect).  So recordings
-are fitted one after the other, each with the posterior of the previous ones as its prior, and then in turn again, each
-with the likelihood factors of all others in its prior, until all are at the same shared values: the optimum of all
-recordings together, in any order (expectation propagation by Laplace's method: Minka 2001, Proc. UAI 17:362).
-FittedModel.held_out_chi2, the reduced chi-square of the held-out blocks, says how well the model predicts data that it
-was not fitted to; `gap` compares it with what the sensors' noise alone leaves.
+belongs to a recording, and so do the parameters of an effect of the record (see terra.effects.effect).  `joint_fit`
+finds the optimum of all recordings together.  FittedModel.held_out_chi2, the reduced chi-square of the held-out
+blocks, says how well the model predicts data that it was not fitted to; `gap` compares it with what the sensors' noise
+alone leaves.
 """
 
 from __future__ import annotations
@@ -18,20 +16,20 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, own_parameters
+from soilbus.diagnosis.joint_fit import Start, fit_jointly, own_gains, priors_of
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import Fit, Start, fit_from, fit_window
+from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import RESIDUAL, Latents, Linearisation, ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective, Termination
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
@@ -97,10 +95,8 @@ class FittedModel:
         Parameters of the effects; one that is held at the edge of its range has std 0.
     free_unheld
         The same before any was held.
-    first_prior
-        Of soil, gains and parameters before any recording.
-    joint_prior
-        The same for each recording, with what the other recordings say of the shared ones.
+    priors
+        Of soil, gains and parameters of each recording, with its part of the prior of what all share.
     fits, checks
         Of each recording.
     mixture_correction
@@ -114,8 +110,7 @@ class FittedModel:
     effects: tuple[Effect, ...]
     free: tuple[Free, ...]
     free_unheld: tuple[Free, ...]
-    first_prior: Gaussian
-    joint_prior: tuple[Gaussian, ...]
+    priors: tuple[Gaussian, ...]
     fits: tuple[Fit, ...]
     checks: tuple[HeldOutCheck, ...]
     mixture_correction: float = 0.0
@@ -328,15 +323,15 @@ def fit_model(
     fitted = _fits(records, prior, effects, free, starts, options)
     for _ in range(len(free)):
         held = (
-            None if fitted is None else _held_at_edges(records[0].training.with_effects(effects, free), fitted[2], free)
+            None if fitted is None else _held_at_edges(records[0].training.with_effects(effects, free), fitted[1], free)
         )
         if fitted is None or held is None:
             break
-        free, starts = held, [_start(fit) for fit in fitted[2]]
+        free, starts = held, [_start(fit) for fit in fitted[1]]
         fitted = _fits(records, prior, effects, free, starts, options)
     if fitted is None:
         return None
-    first_prior, joint_priors, fits = fitted
+    priors, fits = fitted
     checks = [
         check(
             record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i], record.options
@@ -346,7 +341,7 @@ def fit_model(
     added = [effect for effect in effects if effect not in present.effects]
     correction = sum(_mixture_correction(effect, free, fits, checks) for effect in added)
     return FittedModel(
-        tuple(effects), free, free_unheld, first_prior, tuple(joint_priors), tuple(fits), tuple(checks), correction,
+        tuple(effects), free, free_unheld, priors, tuple(fits), tuple(checks), correction,
         expected_chi2=_expected_chi2(records, effects, free, fits, checks),
     )  # fmt: skip
 
@@ -404,199 +399,13 @@ def _fits(
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
     options: SolverOptions,
-) -> tuple[Gaussian, list[Gaussian], list[Fit]] | None:
-    """The prior before any recording, the joint prior of each, and its fit; None where one fails."""
-    joint_priors: list[Gaussian] = []
-    fits: list[Fit] = []
+) -> tuple[tuple[Gaussian, ...], list[Fit]] | None:
+    """The prior of each recording, and its fit; None where one fails."""
     problems = [record.training.with_effects(effects, free) for record in records]
-    own = _own(problems[0], effects)
-    for i, problem in enumerate(problems):
-        if fits:
-            joint_prior = _prior_of_next(fits[-1].mode, prior, problem, own)
-        else:
-            joint_prior = _prior_of_first(records[0], prior, problem)
-        fit = _fitted(problem, prior, joint_prior, None if starts is None else starts[i], options)
-        if fit is None:
-            return None
-        joint_priors.append(joint_prior)
-        fits.append(fit)
-    first = joint_priors[0]
-    if len(records) > 1 and records[0].joint_prior is None:
-        descent = replace(options, give_up_above=np.inf)
-        joint_priors, fits = _swept(problems, prior, first, own, joint_priors, fits, descent)
-    return first, joint_priors, fits
-
-
-def _own(problem: ObservationModelWithEffects, effects: Sequence[Effect]) -> list[int]:
-    """Indices of the gains that each recording has for itself."""
-    by_name = {effect.name: effect for effect in effects}
-    return [
-        problem.n_sensors + i
-        for i, free in enumerate(problem.free)
-        if by_name[free.effect].own_in_each_record(free.parameter)
-    ]
-
-
-class _Natural(NamedTuple):
-    """A Gaussian factor of the shared gains (S,): exp(vector' x - x' information x / 2)."""
-
-    information: Array
-    vector: Array
-
-    def __add__(self, other: object) -> _Natural:
-        assert isinstance(other, _Natural)
-        return _Natural(self.information + other.information, self.vector + other.vector)
-
-    def without(self, other: _Natural) -> _Natural:
-        """The factor divided by another."""
-        return _Natural(self.information - other.information, self.vector - other.vector)
-
-    @property
-    def is_proper(self) -> bool:
-        """Whether the information is positive definite."""
-        return bool(np.linalg.eigvalsh(self.information)[0] > 0.0)
-
-    @property
-    def log_determinant(self) -> float:
-        """Of the information."""
-        return float(np.linalg.slogdet(self.information)[1])
-
-    @property
-    def mean(self) -> Array:
-        """Where the factor is greatest."""
-        return np.asarray(np.linalg.solve(self.information, self.vector))
-
-    def squared_distance(self, x: Array) -> float:
-        """-2 log of the factor at x, relative to its maximum."""
-        away = x - self.mean
-        return float(away @ self.information @ away)
-
-
-def _swept(
-    problems: Sequence[ObservationModelWithEffects],
-    prior: SoilPrior,
-    first: Gaussian,
-    own: Sequence[int],
-    joint_priors: list[Gaussian],
-    fits: list[Fit],
-    descent: SolverOptions,
-) -> tuple[list[Gaussian], list[Fit]]:
-    """Joint priors and fits at the optimum of all recordings together.
-
-    The fits' -2 log evidence and posterior are such that they add up to those of all recordings.  A recording whose
-    fit fails keeps the one that it has, and so does one whose cavity is no distribution: where fits do not converge, a
-    factor may hold negative information.
-    """
-    shared = np.setdiff1d(np.flatnonzero(np.diag(first.covariance)[_SOIL:] > 0.0), own)
-    if not len(shared):
-        return joint_priors, fits
-    priors, fits = list(joint_priors), list(fits)
-    factors = [_natural(f.mode, shared).without(_natural(p, shared)) for f, p in zip(fits, priors, strict=True)]
-    before = _natural(first, shared)
-    for _ in range(6):
-        moved = 0.0
-        for i, problem in enumerate(problems):
-            others = before
-            for j, factor in enumerate(factors):
-                others = others if j == i else others + factor
-            if not others.is_proper:
-                moved = np.inf
-                continue
-            cavity = _with_shared(Gaussian.of(prior, problem.gain_std), shared, others)
-            fit = _fitted(problem, prior, cavity, _start(fits[i]), descent)
-            if fit is None:
-                continue
-            sd = np.sqrt(np.diag(fit.mode.covariance)[_SOIL + shared])
-            moved = max(moved, float(np.max(np.abs(fit.mode.gains - fits[i].mode.gains)[shared] / sd)))
-            priors[i], fits[i] = cavity, fit
-            factors[i] = _natural(fit.mode, shared).without(others)
-        if moved < 0.1:  # posterior sd
-            break
-    else:
-        fits = [replace(fit, termination=Termination.LIMIT) for fit in fits]
-    return priors, _adding_up(before, factors, [_natural(p, shared) for p in priors], fits, shared)
-
-
-def _adding_up(
-    first: _Natural,
-    factors: Sequence[_Natural],
-    priors: Sequence[_Natural],
-    fits: Sequence[Fit],
-    shared: NDArray[np.intp],
-) -> list[Fit]:
-    """The fits with the prior of the shared gains counted once, with the first one, all at the same shared gains.
-
-    A recording's objective is least at its own shared gains, those of all recordings are a small step away.
-    """
-    together = first
-    for factor in factors:
-        together = together + factor
-    at, out = together.mean, []
-    for i, (fit, joint_prior) in enumerate(zip(fits, priors, strict=True)):
-        alone = _natural(fit.mode, shared)
-        change = alone.squared_distance(at) - joint_prior.squared_distance(at)
-        penalty = joint_prior.log_determinant - alone.log_determinant
-        if i == 0:
-            change += first.squared_distance(at)
-            penalty += together.log_determinant - first.log_determinant
-        evidence, posterior = fit.neg2_log_evidence + change + penalty, fit.neg2_log_posterior + change
-        out.append(replace(fit, neg2_log_evidence=evidence, neg2_log_posterior=posterior))
-    return out
-
-
-def _natural(gaussian: Gaussian, shared: NDArray[np.intp]) -> _Natural:
-    at = _SOIL + shared
-    information = np.asarray(np.linalg.inv(gaussian.covariance[np.ix_(at, at)]))
-    return _Natural(information, information @ gaussian.gains[shared])
-
-
-def _with_shared(gaussian: Gaussian, shared: NDArray[np.intp], factor: _Natural) -> Gaussian:
-    """The Gaussian with another distribution of the shared gains, which are independent of the rest in it."""
-    gains, covariance = gaussian.gains.copy(), gaussian.covariance.copy()
-    at = _SOIL + shared
-    covariance[np.ix_(at, at)] = np.linalg.inv(factor.information)
-    gains[shared] = np.linalg.solve(factor.information, factor.vector)
-    return replace(gaussian, gains=gains, covariance=covariance)
-
-
-def _prior_of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEffects) -> Gaussian:
-    """Joint prior of the first recording: its own if it has one, and the catalogue's for effects that are added."""
-    joint_prior = Gaussian.of(prior, problem.gain_std)
-    if record.joint_prior is None:
-        return joint_prior
-    gains, covariance = joint_prior.gains.copy(), joint_prior.covariance.copy()
-    n = len(record.joint_prior.gains)
-    gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.joint_prior.gains, record.joint_prior.covariance
-    return Gaussian(record.joint_prior.soil, gains, covariance)
-
-
-def _prior_of_next(
-    posterior: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, own: Sequence[int]
-) -> Gaussian:
-    """Joint prior of the next recording: the posterior, with the prior of what is each recording's own."""
-    after = posterior.with_prior_soil(prior)
-    gains, covariance = after.gains.copy(), after.covariance.copy()
-    for i in own:
-        covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0
-        covariance[_SOIL + i, _SOIL + i] = problem.gain_std[i] ** 2
-        gains[i] = 0.0
-    return Gaussian(after.soil, gains, covariance)
-
-
-def _fitted(
-    problem: ObservationModelWithEffects,
-    prior: SoilPrior,
-    joint_prior: Gaussian,
-    start: Start | None,
-    options: SolverOptions,
-) -> Fit | None:
-    """Fit from the start; if None from several, and from the best of these where that one has not converged."""
-    if start is None:
-        fit = fit_window(problem, prior, joint_prior)
-        if fit is None or fit.converged:
-            return fit
-        start = Start(fit.mode.soil, fit.mode.gains)
-    return fit_from(problem, prior, joint_prior, start, options)
+    own = own_gains(problems[0].n_sensors, effects, free)
+    priors = priors_of(problems, prior, own, records[0].joint_prior)
+    fits = fit_jointly(problems, prior, priors, own, starts, options)
+    return None if fits is None else (priors, fits)
 
 
 def _held_at_edges(

@@ -25,10 +25,10 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck, fit_model
+from soilbus.diagnosis.joint_fit import Start
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import gap_limit
-from soilbus.estimation.multistart import Start
 from soilbus.estimation.observation_model import RESIDUAL
 from soilbus.estimation.posterior import SoilPrior
 

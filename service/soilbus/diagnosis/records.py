@@ -41,8 +41,8 @@ class Record:
     training, held_out
         Observation models of the two parts.
     joint_prior
-        Posterior of soil, gains and parameters from an earlier fit on the same soil; it replaces the prior in the
-        first recording.
+        Posterior of soil, gains and parameters from an earlier fit on the same soil; it replaces the prior of a single
+        recording.
     whole, fold
         Observation model of all instants, and the fold (N,) of each; None where no other fold can be held out.
     options

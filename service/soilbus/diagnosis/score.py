@@ -7,8 +7,7 @@ parameters of its effects).  The Schur complement H is the information on u that
 From H and g follow the fall of -2 log posterior if the effect were added, the change of -2 log evidence, and a start
 for the effect's fit (Rao's score test, Bayesian with the prior's precision).
 
-Of several recordings c holds the soil and the own parameters of each, and the gains that all share: each recording's
-own coordinates are eliminated, the equations in (gains, u) added up, and then the gains eliminated.
+Of several recordings c holds the soil and the own parameters of each, and the gains that all share (`joint_fit`).
 """
 
 from __future__ import annotations
@@ -20,19 +19,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 from scipy.optimize import lsq_linear
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.joint_fit import JointModel, JointObjective, Start, own_gains
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
-from soilbus.estimation.multistart import Start
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.observation_model import Latents
-from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
+from soilbus.estimation.posterior import NORMAL_95, SoilPrior
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
 
 
@@ -50,32 +48,6 @@ class Score:
     starts: tuple[Start, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class NormalEquations:
-    """Normal equations of one recording, reduced to the P parameters of candidate effects.
-
-    gradient (P,) and information (P, P) are of the data alone, without the parameters' prior.  response (C, P) is
-    H_cc^-1 H_cu: the present coordinates follow a step u by -response u.  fitted is the present model.
-    is_own (C,): which present coordinates belong to this recording alone.
-    """
-
-    objective: Objective
-    iterate: Iterate
-    quadratic: QuadraticModel
-    is_own: NDArray[np.bool_]
-    gradient: Array
-    information: Array
-    response: Array
-    held_out_latents: Latents
-    fitted: FittedModel
-
-    @property
-    def shared_gains(self) -> NDArray[np.intp]:
-        """Indices (S,) of the gains that move and that all recordings share."""
-        present = self.objective.active[: len(self.objective.active) - len(self.gradient)]
-        return np.asarray(present[~self.is_own[len(self.objective.free) :]])
-
-
 def scores(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> list[Score]:
@@ -89,11 +61,7 @@ def scores(
     n_wheels = len(records[0].training.rig.wheels)
     free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
     equations = normal_equations(records, prior, present, candidates, free)
-    joint = joint_equations(equations)
-    found = []
-    for effect in candidates:
-        columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
-        found.append(_score(effect, columns, free, equations, joint))
+    found = [_score(effect, free, equations) for effect in candidates]
     return sorted(found, key=lambda score: score.neg2_log_evidence)
 
 
@@ -148,181 +116,110 @@ def _with_offset(start: Start, offsets: Sequence[float]) -> Start:
     return Start(start.soil, gains)
 
 
+class Reduced(NamedTuple):
+    """Normal equations of the parameters u (P,) of one effect, the present coordinates eliminated; of the data alone.
+
+    gradient is (P,), information (P, P).  All coordinates (n,) follow a step of u: they change by
+    offset + response u, offset (n,) and response (n, P).
+    """
+
+    gradient: Array
+    information: Array
+    offset: Array
+    response: Array
+
+
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """Normal equations of all recordings, by the present model's coordinates and the candidates' parameters.
+
+    Attributes
+    ----------
+    joint, model
+        Objective with the present effects and all candidates, and its quadratic model where the present model was
+        fitted.
+    iterates
+        Of each recording there.
+    fitted
+        The present model.
+    n_new
+        Number of the candidates' parameters, the last coordinates of each recording.
+    solved
+        (C, 1 + n): H_cc^-1 (g_c, H_c.) of the C present coordinates.
+    """
+
+    joint: JointObjective
+    model: JointModel
+    iterates: tuple[Iterate, ...]
+    fitted: FittedModel
+    n_new: int
+    present: NDArray[np.intp]
+    solved: Array
+
+    def reduced(self, parameters: NDArray[np.intp], record: int = 0) -> Reduced:
+        """Those of some candidates' parameters (P,); record: the recording, of parameters that each has for itself."""
+        u = self.joint.columns[record][-self.n_new :][parameters]
+        by_present = self.model.information[np.ix_(u, self.present)]
+        gradient, by_u = self.solved[:, 0], self.solved[:, 1 + u]
+        offset, response = np.zeros(self.joint.size), np.zeros((self.joint.size, len(u)))
+        offset[self.present], response[self.present] = -gradient, -by_u
+        response[u] = np.eye(len(u))
+        of_data = self.model.information[np.ix_(u, u)] - self.model.prior_information[np.ix_(u, u)]
+        return Reduced(self.model.gradient[u] - by_present @ gradient, of_data - by_present @ by_u, offset, response)
+
+
 def normal_equations(
     records: Sequence[Record],
     prior: SoilPrior,
     present: FittedModel,
     candidates: Sequence[Effect],
     free: Sequence[Free],
-) -> list[NormalEquations]:
-    """The reduced normal equations of each recording for candidates with these parameters."""
-    return [_reduced(record, prior, present, i, candidates, free) for i, record in enumerate(records)]
-
-
-@dataclass(frozen=True, slots=True)
-class JointEquations:
-    """Normal equations of all recordings, reduced to the P parameters that they share.
-
-    gradient (P,) and information (P, P) are of the data alone.  follow: of each recording, how its present coordinates
-    (C,) change with no effect, and by u (C, P).
-    """
-
-    gradient: Array
-    information: Array
-    follow: tuple[tuple[Array, Array], ...]
-
-
-def joint_equations(equations: Sequence[NormalEquations]) -> JointEquations:
-    """The normal equations of all recordings together, in which the gains that they share are the same.
-
-    Each is taken about its own optimum, without what its prior holds of the others; the gains' prior is added once.
-    """
-    parts = [_without_own(one) for one in equations]
-    at, shared = equations[-1].iterate.gains, equations[0].shared_gains
-    information, gradient = np.zeros_like(parts[0].information), np.zeros(len(parts[0].gradient))
-    gains = slice(None, len(shared))
-    first = equations[0].fitted.first_prior
-    precision = _precision(first, shared)
-    information[gains, gains] = precision
-    gradient[gains] = precision @ (at[shared] - first.gains[shared])
-    moved = []
-    for one, part in zip(equations, parts, strict=True):
-        moved.append((at - one.iterate.gains)[shared])
-        information += part.information
-        gradient += part.gradient + part.information[:, : len(shared)] @ moved[-1]
-    u = slice(len(shared), None)
-    solved = np.linalg.solve(information[gains, gains], np.column_stack([gradient[gains], information[gains, u]]))
-    follow = []
-    for one, part, change in zip(equations, parts, moved, strict=True):
-        step = np.column_stack([change, np.zeros((len(shared), len(one.gradient)))]) - solved
-        present = np.zeros((len(one.is_own), step.shape[1]))
-        present[~one.is_own] = step
-        present[one.is_own] = -part.own_solved[:, : 1 + len(one.gradient)] - part.own_by_gains @ step
-        follow.append((present[:, 0], present[:, 1:]))
-    return JointEquations(
-        gradient[u] - information[u, gains] @ solved[:, 0],
-        information[u, u] - information[u, gains] @ solved[:, 1:],
-        tuple(follow),
-    )
-
-
-class _WithoutOwn(NamedTuple):
-    """Equations (S + P) of shared gains and u, a recording's own coordinates o eliminated.
-
-    own_solved (O, 1 + P): H_oo^-1 (g_o, H_ou); own_by_gains (O, S): H_oo^-1 H_og.
-    """
-
-    information: Array
-    gradient: Array
-    own_solved: Array
-    own_by_gains: Array
-
-
-def _without_own(equations: NormalEquations) -> _WithoutOwn:
-    """The equations of one recording's data, with the prior of its own coordinates but not of the gains."""
-    P, shared = len(equations.gradient), equations.shared_gains
-    H, g = equations.quadratic.information.copy(), equations.quadratic.gradient.copy()
-    own = np.concatenate([equations.is_own, np.zeros(P, bool)])
-    gains = np.concatenate([~equations.is_own, np.zeros(P, bool)])
-    H[-P:, -P:] -= np.eye(P)
-    prior = equations.objective.joint_prior
-    precision = _precision(prior, shared)
-    H[np.ix_(gains, gains)] -= precision
-    g[gains] -= precision @ (equations.iterate.gains - prior.gains)[shared]
-    rest = ~own
-    K = np.linalg.solve(H[np.ix_(own, own)], np.column_stack([g[own], H[np.ix_(own, rest)]]))
-    cross, S = H[np.ix_(rest, own)], len(shared)
-    return _WithoutOwn(
-        H[np.ix_(rest, rest)] - cross @ K[:, 1:],
-        g[rest] - cross @ K[:, 0],
-        np.column_stack([K[:, 0], K[:, 1 + S :]]),
-        K[:, 1 : 1 + S],
-    )
-
-
-def _precision(prior: Gaussian, gains: NDArray[np.intp]) -> Array:
-    """Inverse of the covariance of some gains in a prior."""
-    at = len(PARAMETERS) + gains
-    return np.asarray(np.linalg.inv(prior.covariance[np.ix_(at, at)]))
-
-
-def _reduced(
-    record: Record,
-    prior: SoilPrior,
-    present: FittedModel,
-    i: int,
-    candidates: Sequence[Effect],
-    free: Sequence[Free],
 ) -> NormalEquations:
-    """The normal equations of recording i with the present model's coordinates eliminated."""
-    problem = record.training.with_effects((*present.effects, *candidates), (*present.free, *free))
-    fit, joint_prior, P = present.fits[i], present.joint_prior[i], len(free)
-    covariance = np.zeros((len(joint_prior.covariance) + P,) * 2)
-    covariance[:-P, :-P], covariance[-P:, -P:] = joint_prior.covariance, np.eye(P)
-    extended = Gaussian(joint_prior.soil, np.concatenate([joint_prior.gains, np.zeros(P)]), covariance)
-    gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
-    iterate = Iterate(fit.optimum.soil, gains, fit.optimum.latents)
-    objective = Objective(problem, prior, extended)
+    """The normal equations of the present model and candidates with these parameters, where it was fitted.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where the present model is not finite or its information is singular.
+    """
+    P, R, of_record = len(free), len(records), {effect.name: effect.of_record for effect in candidates}
+    new_own = np.array([of_record[f.effect] for f in free])
+    own = np.concatenate([own_gains(records[0].training.n_sensors, present.effects, present.free), new_own])
+    variance = np.where(new_own, 1.0, float(R))
+    effects, parameters = (*present.effects, *candidates), (*present.free, *free)
+    parts, iterates = [], []
+    for record, fit, before in zip(records, present.fits, present.priors, strict=True):
+        covariance = block_diag(before.covariance, np.diag(variance))
+        extended = Gaussian(before.soil, np.append(before.gains, np.zeros(P)), covariance)
+        parts.append(Objective(record.training.with_effects(effects, parameters), prior, extended))
+        gains = np.append(fit.optimum.gains, np.zeros(P))
+        iterates.append(Iterate(fit.optimum.soil, gains, fit.optimum.latents))
+    joint = JointObjective(parts, own)
     with np.errstate(all="ignore"):
-        quadratic = objective.quadratic_model(iterate)
-    if quadratic is None:
+        model = joint.quadratic_model(tuple(iterates))
+    if model is None:
         raise np.linalg.LinAlgError("the model is not finite where it was fitted")
-    present_columns, new = slice(None, -P), slice(-P, None)
-    information = quadratic.information
-    inverse = solve_with_inverse(information[present_columns, present_columns], np.zeros(len(information) - P))
+    new = np.unique([columns[-P:] for columns in joint.columns])
+    c = np.setdiff1d(np.arange(joint.size), new)
+    inverse = solve_with_inverse(model.information[np.ix_(c, c)], np.zeros(len(c)))
     if inverse is None:
         raise np.linalg.LinAlgError("the present model's information is singular")
-    response = inverse[1] @ information[present_columns, new]
-    reduced = information[new, new] - np.eye(P) - information[new, present_columns] @ response
-    gradient = quadratic.gradient[new] - response.T @ quadratic.gradient[present_columns]
-    held_out = present.checks[i].latents
-    by_name = {effect.name: effect for effect in present.effects}
-    own = [
-        record.training.n_sensors + k
-        for k, f in enumerate(present.free)
-        if by_name[f.effect].own_in_each_record(f.parameter)
-    ]
-    is_own = np.concatenate([np.ones(len(objective.free), bool), np.isin(objective.active[:-P], own)])
-    return NormalEquations(
-        objective,
-        iterate,
-        quadratic,
-        is_own,
-        gradient,
-        reduced,
-        response,
-        held_out,
-        present,
-    )
+    solved = inverse[1] @ np.column_stack([model.gradient[c], model.information[c]])
+    return NormalEquations(joint, model, tuple(iterates), present, P, c, solved)
 
 
-def _score(
-    effect: Effect,
-    columns: NDArray[np.intp],
-    free: Sequence[Free],
-    equations: Sequence[NormalEquations],
-    joint: JointEquations,
-) -> Score:
+def _score(effect: Effect, free: Sequence[Free], equations: NormalEquations) -> Score:
     """One effect's score over all recordings; an effect of the record has parameters of its own in each."""
-    block = np.ix_(columns, columns)
-    own = [free[i] for i in columns.tolist()]
-    parts: Sequence[NormalEquations | JointEquations] = equations if effect.of_record else [joint]
-    solutions = [
-        _bounded_minimum(one.information[block] + np.eye(len(own)), one.gradient[columns], own) for one in parts
-    ]
+    parameters = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
+    own, recordings = [free[i] for i in parameters.tolist()], range(len(equations.iterates))
+    parts = [equations.reduced(parameters, i) for i in (recordings if effect.of_record else (0,))]
+    solutions = [_bounded_minimum(one.information + np.eye(len(own)), one.gradient, own) for one in parts]
+    starts = []
+    for i in recordings:
+        of_own = i if effect.of_record else 0
+        starts.append(_start(equations, i, parameters, parts[of_own], solutions[of_own].step))
     fall = sum(solution.fall for solution in solutions)
-    neg2_log_evidence = sum(solution.neg2_log_evidence for solution in solutions)
-    if effect.of_record:
-        starts = tuple(
-            _start(one, columns, solution.step, 0.0, -one.response)
-            for one, solution in zip(equations, solutions, strict=True)
-        )
-    else:
-        starts = tuple(
-            _start(one, columns, solutions[0].step, *follow)
-            for one, follow in zip(equations, joint.follow, strict=True)
-        )
-    return Score(effect, fall, neg2_log_evidence, starts)
+    return Score(effect, fall, sum(solution.neg2_log_evidence for solution in solutions), tuple(starts))
 
 
 class _Minimum(NamedTuple):
@@ -356,25 +253,19 @@ def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) 
 
 
 def _start(
-    equations: NormalEquations, columns: NDArray[np.intp], step: Array, offset: Array | float, by_u: Array
+    equations: NormalEquations, record: int, parameters: NDArray[np.intp], reduced: Reduced, step: Array
 ) -> Start:
-    """Where a fit of one recording with the effect begins: at the step (P,), shortened to the prior's 95 % interval.
-
-    offset (C,) and by_u (C, P): what the present coordinates change by, and by each of all parameters.
-    """
+    """Where a fit of one recording with the effect begins: at the step (P,), shortened to the prior's 95 % interval."""
     share = min(1.0, NORMAL_95 / max(float(np.abs(step).max(initial=0.0)), 1e-12))
-    step = share * step
-    follow = offset + by_u[:, columns] @ step
-    objective, iterate = equations.objective, equations.iterate
-    n_free, n_present = len(objective.free), len(iterate.gains) - len(equations.information)
-    soil = objective.coordinates.stepped(iterate.soil, follow[:n_free])
-    gains = iterate.gains[:n_present].copy()
-    gains[objective.active[objective.active < n_present]] += follow[n_free:]
-    standardised = np.concatenate([equations.fitted.unheld(gains), step])
-    start = Start(soil, standardised, checked=equations.held_out_latents)
+    objective, iterate = equations.joint.parts[record], equations.iterates[record]
+    change = (reduced.offset + reduced.response @ (share * step))[equations.joint.columns[record]]
+    n_free, n_present = len(objective.free), len(iterate.gains) - equations.n_new
+    soil, gains = objective.coordinates.stepped(iterate.soil, change[:n_free]), iterate.gains.copy()
+    gains[objective.active] += change[n_free:]
+    standardised = np.append(equations.fitted.unheld(gains[:n_present]), gains[n_present + parameters])
+    start = Start(soil, standardised, checked=equations.fitted.checks[record].latents)
     if share < 1.0:
         return start
-    change = np.zeros(len(iterate.gains))
-    change[:n_present], change[n_present + columns] = gains - iterate.gains[:n_present], step
-    latents = objective.problem.updated(equations.quadratic.linearisation, iterate.latents, soil - iterate.soil, change)
+    at = equations.model.parts[record].linearisation
+    latents = objective.problem.updated(at, iterate.latents, soil - iterate.soil, gains - iterate.gains)
     return start._replace(near_optimum=True, latents=latents)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from soilbus.diagnosis.delays import exceeds_sampling_delay
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.gap import gap_of_fold
+from soilbus.diagnosis.joint_fit import Start
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Score, further_scores, scores
@@ -29,7 +30,6 @@ from soilbus.diagnosis.verdict import (
     required_fall,
     temperature,
 )
-from soilbus.estimation.multistart import Start
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect

@@ -32,7 +32,7 @@ from soilbus.diagnosis.evidence import OwnParameters, own_parameters
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.options import DEFAULT, TYPE_DEFAULT, TypeOptions
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import joint_equations, normal_equations, scores
+from soilbus.diagnosis.score import normal_equations, scores
 from soilbus.diagnosis.verdict import TEMPERED_FALL_OF_NONE, temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import Estimate, SoilPrior
@@ -177,15 +177,15 @@ def _by_score(
     if not effects:
         return {}
     free = [f for effect in effects for f in parameters_of(effect, records[0].training.n_wheels)]
-    joint = joint_equations(normal_equations(records, prior, present, effects, free))
+    equations = normal_equations(records, prior, present, effects, free)
     found = {}
     for score in scores(records, prior, present, effects):
         effect = score.effect
         shared = [
             i for i, f in enumerate(free) if f.effect == effect.name and not effect.own_in_each_record(f.parameter)
         ]
-        information, vector = joint.information[np.ix_(shared, shared)], -joint.gradient[shared]
-        own = OwnParameters(information, vector, tuple(free[i] for i in shared))
+        reduced = equations.reduced(np.array(shared, int))
+        own = OwnParameters(reduced.information, -reduced.gradient, tuple(free[i] for i in shared))
         found[effect.name] = -score.neg2_log_evidence, own
     return found
 

@@ -9,8 +9,8 @@ prior) and the Gaussian there,
 `fit_window` finds it where nothing is known: the soil alone descends on a few instants, with loads and speeds as
 measured, from the prior's median, loam and the likeliest soils of the table until two descents meet; from the best end
 soil, gains and latents descend together on all instants.  Where the data allow a second mode, it is looked for too,
-and the two share the probability by their evidence.  `fit_warm` starts at the optimum of the window before, `fit_from`
-at a given soil with gains and effect parameters.  All return a `Fit`.
+and the two share the probability by their evidence.  `fit_warm` starts at the optimum of the window before.
+All return a `Fit`.
 """
 
 from __future__ import annotations
@@ -25,54 +25,22 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.model_form import FormPosterior
-from soilbus.estimation.observation_model import (
-    CurvedPathFit,
-    Latents,
-    ObservationModel,
-    Optimum,
-)
-from soilbus.estimation.options import SolverOptions
+from soilbus.estimation.observation_model import CurvedPathFit, ObservationModel, Optimum
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
-from soilbus.estimation.solver import CONVERGED, Iterate, Objective, QuadraticModel, Solution, Termination, minimise
+from soilbus.estimation.solver import CONVERGED, Iterate, Objective, Solution, Termination, WindowModel, minimise
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
 __all__ = [
     "Fit",
     "SecondMode",
-    "Start",
     "fit_at",
-    "fit_from",
     "fit_from_soil",
     "fit_window",
 ]
 
 _K_C = PARAMETERS.index("k_c")
-
-
-class Start(NamedTuple):
-    """Where a fit begins.
-
-    Attributes
-    ----------
-    soil : (6,)
-        In SI.
-    gains : (G,)
-        Sensors' gains and effects' parameters.
-    near_optimum
-        Whether a fit of the same model ended there, on the same or on fewer instants.
-    latents
-        Prediction of the latents there, if of the same instants.
-    checked
-        The same for the instants that are held out.
-    """
-
-    soil: Array
-    gains: Array
-    near_optimum: bool = False
-    latents: Latents | None = None
-    checked: Latents | None = None
 
 
 class SecondMode(NamedTuple):
@@ -215,55 +183,12 @@ def fit_from_soil(
         return _cold_fit(Objective(problem, prior, joint_prior), near)
 
 
-def fit_from(
-    problem: ObservationModel,
-    prior: SoilPrior,
-    joint_prior: Gaussian,
-    start: Start,
-    options: SolverOptions,
-) -> Fit | None:
-    """Fit from a given start, to be compared with others by its objective.
-
-    Parameters
-    ----------
-    problem, prior, joint_prior
-        The window and its priors.
-    start
-        Near an optimum everything moves from there.  Otherwise soil and effect parameters move first, with the
-        latents as measured, for up to half the evaluations.
-    options
-        Of the joint descent.
-
-    Returns
-    -------
-    Fit or None
-        None where the numbers are not finite, or where the fit stays above `give_up_above`.
-    """
-    search, objective = problem.options.search, Objective(problem, prior, joint_prior)
-    gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
-    with np.errstate(all="ignore"):
-        if start.near_optimum:
-            end = minimise(objective, objective.start_near(start.soil, gains, start.latents), options, 0.0)
-        else:
-            as_measured = Objective(problem, prior, joint_prior, as_measured=True)
-            first = replace(
-                search.soil_alone,
-                max_evaluations=options.max_evaluations // 2,
-            )
-            near = minimise(as_measured, as_measured.start(start.soil, gains=gains), first)
-            if near.termination in (Termination.GIVEN_UP, Termination.NOT_FINITE):
-                return None
-            end = minimise(objective, near.previous, options)
-        fit = fit_at(objective, end)
-    return None if fit is None or fit.neg2_log_posterior > options.give_up_above else fit
-
-
 class WarmStart(NamedTuple):
     """A window at the optimum of the window before; its quadratic model there, None where that is not finite."""
 
     objective: Objective
     iterate: Iterate
-    model: QuadraticModel | None
+    model: WindowModel | None
 
 
 def warm_start(
@@ -446,14 +371,14 @@ def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence
     return end if end is not None and squared_distance(end) > away else None
 
 
-def _cold_fit(objective: Objective, near: Solution) -> Fit | None:
+def _cold_fit(objective: Objective, near: Solution[Iterate, WindowModel]) -> Fit | None:
     """The fit by a joint descent from where one with latents as measured ended; None where it is not finite."""
     if near.model is None:
         return None
     return fit_at(objective, minimise(objective, near.previous, objective.options.cold), near.evaluations)
 
 
-def fit_at(objective: Objective, end: Solution, evaluations: int = 0) -> Fit | None:
+def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluations: int = 0) -> Fit | None:
     """The fit at the end of a descent, after evaluations of the model before it; None where it is not finite."""
     if end.model is None:
         return None

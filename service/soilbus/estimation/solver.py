@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticModel:
-    """The objective's quadratic model at an iterate, by F free coordinates and A active gains.
+    """An objective's quadratic model at an iterate, by F free coordinates and A active gains.
 
     Attributes
     ----------
@@ -76,8 +76,6 @@ class QuadraticModel:
         Value of the objective, up to a constant.
     active_bounds : (E, F + A)
         Outward directions of the bounds that the iterate is at: no step goes there.
-    linearisation
-        Residuals and Jacobian of the data.
     """
 
     information: Array
@@ -86,7 +84,6 @@ class QuadraticModel:
     gradient: Array
     neg2_log_posterior: float
     active_bounds: Array
-    linearisation: Linearisation
 
     def step(self, damping: float = 0.0) -> Array | None:
         """The step (F + A,) to the model's minimum within the active bounds; None where there is no minimum.
@@ -119,6 +116,13 @@ class QuadraticModel:
     def squared_length(self, step: Array) -> float:
         """Squared length of a step (F + A,) in posterior sd; of a full step it is the predicted decrease."""
         return float(step @ self.information @ step)
+
+
+@dataclass(frozen=True, slots=True)
+class WindowModel(QuadraticModel):
+    """The quadratic model of a window, with the linearisation of its data: residuals and Jacobian."""
+
+    linearisation: Linearisation
 
 
 class GaussianApproximation(NamedTuple):
@@ -223,7 +227,7 @@ class Objective:
             return self.start(soil, gains=gains)
         return Iterate(soil, gains, latents)
 
-    def stepped(self, iterate: Iterate, model: QuadraticModel, step: Array) -> Iterate:
+    def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
         """The iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
         free = len(self.free)
         step = self.step_fraction(iterate, step) * step
@@ -279,12 +283,12 @@ class Objective:
 
     # Residuals, Jacobian, prior: the quadratic model
 
-    def quadratic_model(self, iterate: Iterate) -> QuadraticModel | None:
+    def quadratic_model(self, iterate: Iterate) -> WindowModel | None:
         """The quadratic model at an iterate; None where the observation model is not finite there."""
         linearisation = self.problem.linearise(iterate.as_soil(), iterate.gains, iterate.latents, not self.as_measured)
         return self.with_prior(iterate, linearisation)
 
-    def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> QuadraticModel | None:
+    def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> WindowModel | None:
         """The quadratic model from the data's linearisation at an iterate; None where it is not finite."""
         free = len(self.free)
         directions = self.directions(iterate)
@@ -297,7 +301,7 @@ class Objective:
             return None
         curvature = np.zeros_like(self._identity)
         curvature[:free, :free] = self.coordinates.curvature((gradient + prior.gradient_of_data)[:free])
-        return QuadraticModel(
+        return WindowModel(
             information=directions.T @ linearisation.normal @ directions + prior.information,
             prior_information=prior.information,
             curvature=curvature,
@@ -396,7 +400,26 @@ CONVERGED = frozenset({Termination.STEP, Termination.DECREASE})
 """Terminations of a descent that ended at an optimum."""
 
 
-class Solution(NamedTuple):
+PointT = TypeVar("PointT")
+"""Iterate of an objective."""
+ModelT = TypeVar("ModelT", bound=QuadraticModel)
+"""Its quadratic model there."""
+
+
+class Minimisable(Protocol[PointT, ModelT]):
+    """An objective that `minimise` takes: of one window, or of several recordings together."""
+
+    def quadratic_model(self, iterate: PointT, /) -> ModelT | None:
+        """The quadratic model at an iterate; None where it is not finite."""
+
+    def stepped(self, iterate: PointT, model: ModelT, step: Array, /) -> PointT:
+        """The iterate after a step, shortened at bounds."""
+
+    def with_entry_angles(self, iterate: PointT, /) -> PointT:
+        """The same iterate with its entry angles solved."""
+
+
+class Solution(NamedTuple, Generic[PointT, ModelT]):
     """The end of a descent.
 
     Attributes
@@ -415,33 +438,33 @@ class Solution(NamedTuple):
         Why it ended.
     """
 
-    iterate: Iterate
-    previous: Iterate
-    model: QuadraticModel | None
+    iterate: PointT
+    previous: PointT
+    model: ModelT | None
     predicted_decrease: float
     evaluations: int
     termination: Termination
 
 
-class _Expansion(NamedTuple):
+class _Expansion(NamedTuple, Generic[PointT, ModelT]):
     """An iterate, the quadratic model there, its step with the present damping and the predicted decrease."""
 
-    iterate: Iterate
-    model: QuadraticModel
+    iterate: PointT
+    model: ModelT
     step: Array
     decrease: float
     value: float  # of the objective
 
 
 def minimise(
-    objective: Objective, start: Iterate, options: SolverOptions, last_decrease: float | None = None
-) -> Solution:
+    objective: Minimisable[PointT, ModelT], start: PointT, options: SolverOptions, last_decrease: float | None = None
+) -> Solution[PointT, ModelT]:
     """Descend from a start.
 
     Parameters
     ----------
     objective
-        Of the window.
+        Of a window, or of recordings.
     start
         Where to begin.
     options
@@ -492,7 +515,9 @@ def minimise(
     return Solution(end, here.iterate, here.model, here.decrease, evaluations, ended)
 
 
-def _extrapolation(options: SolverOptions, here: _Expansion, last_step: Array, last_fraction: float) -> float:
+def _extrapolation(
+    options: SolverOptions, here: _Expansion[PointT, ModelT], last_step: Array, last_fraction: float
+) -> float:
     """Multiple of a full step to take, from the last one (F + A,) and the fraction of it that was taken.
 
     Aitken's extrapolation: above 1 where steps shrink slowly, below 1 where they turn back, else 1.
@@ -504,13 +529,15 @@ def _extrapolation(options: SolverOptions, here: _Expansion, last_step: Array, l
     return min(1.0 / max(1.0 - ratio, 1.0 / options.max_extrapolation), options.max_extrapolation)
 
 
-def _expanded(objective: Objective, iterate: Iterate, damping: float) -> _Expansion | None:
+def _expanded(
+    objective: Minimisable[PointT, ModelT], iterate: PointT, damping: float
+) -> _Expansion[PointT, ModelT] | None:
     """The quadratic model at an iterate with its step; None where these are not finite."""
     model = objective.quadratic_model(iterate)
     return None if model is None else _with_step(iterate, model, damping)
 
 
-def _with_step(iterate: Iterate, model: QuadraticModel, damping: float) -> _Expansion | None:
+def _with_step(iterate: PointT, model: ModelT, damping: float) -> _Expansion[PointT, ModelT] | None:
     step = model.step(damping)
     return (
         None if step is None else _Expansion(iterate, model, step, model.squared_length(step), model.neg2_log_posterior)
@@ -519,7 +546,7 @@ def _with_step(iterate: Iterate, model: QuadraticModel, damping: float) -> _Expa
 
 def _termination(
     options: SolverOptions,
-    here: _Expansion,
+    here: _Expansion[PointT, ModelT],
     last_decrease: float | None,
     decrease: float,
     evaluations: int,

@@ -122,7 +122,7 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path) -> dict[str, Beside]
 
 def strain(fitted: FittedModel) -> float:
     """Distance of the soil's posterior mean from its prior mean, as chi-square per parameter."""
-    before, after = fitted.joint_prior[-1], fitted.fits[-1].mode
+    before, after = fitted.priors[-1], fitted.fits[-1].mode
     free = np.flatnonzero(np.diag(before.covariance)[:6] > 0.0)
     off = np.log(after.soil[free] / before.soil[free])
     return float(off @ np.linalg.solve(before.covariance[np.ix_(free, free)], off)) / len(free)
