@@ -73,8 +73,13 @@ class ConsistencyInput(NamedTuple):
 
     @property
     def sustained(self) -> int:
-        """Bins for which a contradiction must last."""
+        """Bins for which a contradiction must last, and over which changes are compared."""
         return max(round(self.options.contradiction_time / self.bin), 1)
+
+    @property
+    def compared(self) -> int:
+        """Bins of changes that are compared with each other."""
+        return max(round(self.options.comparison_time / self.bin), 1)
 
 
 class Checked(NamedTuple):
@@ -304,14 +309,14 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
     excess = _axle_excess(window, rig, chassis) / weight
     total = excess.sum(axis=1)
     with np.errstate(invalid="ignore"):
-        wrong = data.driving & (np.abs(total) > options.load_sum)
+        wrong = data.driving & (np.abs(total) > options.load_error)
     if not lasts(wrong, data.sustained):
         return
     front, rear = np.median(excess[wrong], axis=0)
     if not -options.any_load < front + rear < options.any_load:
         yield from (f"load.{wheel}" for wheel in rig.wheels)
         return
-    if min(abs(front), abs(rear)) > options.load_side:
+    if min(abs(front), abs(rear)) > options.load_error:
         return  # something is carried
     of_axle = [np.flatnonzero(rig.front), np.flatnonzero(~rig.front)]
     bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
@@ -319,7 +324,7 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
         left, other = (
             median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
         )
-        if abs(left - other) > options.load_side:
+        if abs(left - other) > options.load_error:
             heavier = 0 if left > other else 1
             yield f"load.{rig.wheels[bad[heavier if front + rear > 0.0 else 1 - heavier]]}"
 
@@ -334,9 +339,7 @@ def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
 
 def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
     """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
-    options = data.options
-    window = data.window
-    lag = max(round(options.contradiction_time / data.bin), 1)
+    window, lag = data.window, data.sustained
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
@@ -392,16 +395,13 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
     Where the ground speed jumps it is the one; where the slip would be impossible with the
     one false it is the other; else it may be either, and both are named.
     """
-    options = data.options
-    window = data.window
-    lag, n = max(round(options.contradiction_time / data.bin), 1), max(round(options.scale_time / data.bin), 1)
+    options, window = data.options, data.window
+    lag, n = data.sustained, data.compared
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
     if len(reported) < n:
         return
-    scale = _scales(
-        np.where(data.driving[lag:], gained, np.nan), reported, n, round(options.max_delay / data.bin), options
-    )
+    scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, lag // 2, options)
     wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
     if not wrong.any():
         return
@@ -418,8 +418,8 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
 def _scales(gained: Array, reported: Array, n: int, late: int, options: ConsistencyOptions) -> Array:
     """Ratios of speed gained to acceleration reported (both (M,)) in each n neighbours, (M - n + 1,); nan where unsure.
 
-    Either may be late by up to `late` bins; of the delays with which the two may go together the
-    one counts with which they are most alike.
+    Either may be late by up to `late` bins; of the delays with which the two go together the one counts with which they
+    are most alike.
     """
     nothing = np.full(late, np.nan)
     moved = neighbours(np.concatenate([nothing, reported, nothing]), len(reported))
@@ -428,12 +428,12 @@ def _scales(gained: Array, reported: Array, n: int, late: int, options: Consiste
     both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(
         len(reported), n
     )
-    enough = (count >= options.known_share * n) & (of_one > n * options.min_speed_rms**2) & (of_other > 0.0)
+    enough = (count >= options.usual_share * n) & (of_one > 0.0) & (of_other > 0.0)
     together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
-    scale = np.divide(both, of_other, where=together > options.possible_correlation, out=np.full(both.shape, np.inf))
+    scale = np.divide(both, of_other, where=together > options.correlation, out=np.full(both.shape, np.inf))
     best = np.argmin(np.abs(np.log(scale)), axis=0)
     chosen = np.take_along_axis(scale, best[None], axis=0)[0]
-    return np.where(together.max(axis=0) > options.sure_correlation, chosen, np.nan)
+    return np.where(np.isfinite(chosen), chosen, np.nan)
 
 
 @lru_cache(maxsize=8)
@@ -453,7 +453,7 @@ def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
 def _jumps(data: ConsistencyInput) -> bool:
     """Whether the ground speed changes at once by what no acceleration about that time explains."""
     options, window = data.options, data.window
-    late = max(round(options.max_delay / data.bin), 1)
+    late = max(data.sustained // 2, 1)
     lag = max(late // 2, 1)  # a change faster than their delay
     jump = np.abs(change(window.ground_speed, lag))
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag))
@@ -466,15 +466,10 @@ def _jumps(data: ConsistencyInput) -> bool:
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     """The draft, where the vehicle pulls less whenever its wheels drive more; needs slope and inertia."""
-    options = data.options
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None:
         return
-    lag, weight, variance = (
-        max(round(options.contradiction_time / data.bin), 1),
-        chassis.mass * GRAVITY,
-        window.variance,
-    )
+    lag, weight, variance = data.sustained, chassis.mass * GRAVITY, window.variance
     driven = change((window.torque / rig.radius).sum(axis=1), lag)
     noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
     known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
@@ -495,13 +490,8 @@ def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], noise: tuple
         both = np.logical_and(*(np.abs(c) > options.significant_sd * sd for c, sd in zip(changes, noise, strict=True)))
     both &= data.driving[len(data.driving) - len(both) :]
     a, b = (change[both] for change in changes)
-    product, n = a * b, max(round(options.opposite_time / data.bin), 1)
-    if np.count_nonzero(product < 0.0) < options.opposite_share * n:
-        return False
-    opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
-    often = opposite >= options.opposite_share * n
-    closely = of_both < -options.possible_correlation * np.sqrt(of_one * of_other)
-    return bool((often & closely).any())
+    opposite = running_sum(a * b < 0.0, data.compared)
+    return bool((opposite >= options.usual_share * data.compared).any())
 
 
 def running_sum(values: NDArray[Any], n: int) -> Array:

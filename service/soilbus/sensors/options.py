@@ -58,8 +58,8 @@ class ConsistencyOptions:
     """
 
     contradiction_time: float = 1.0
-    """Time [s] for which a contradiction must last, and over which changes are compared.  0.7 and 1.3 s: 1 and 2 of 81
-    faults less are found."""
+    """Time [s] for which a contradiction must last, and over which values change; half of it is the longest delay
+    between speed and acceleration.  0.7 and 1.3 s: one fault more of 81 is found."""
     significant_sd: float = 5.0
     """Standard deviations [1] by which a change must stand out of the noise, and the probability below which noise
     leaves equal readings.  30 % either way finds the same faults."""
@@ -79,39 +79,26 @@ class ConsistencyOptions:
     feigned_slip: float = 0.12
     """Slip [1] that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
 
-    load_sum: float = 0.15
-    """Share [1] of the weight by which the loads' sum must be wrong; lost zeros and what is carried stay below it."""
-    load_side: float = 0.10
-    """Share [1] of an axle's load by which its left and right must differ more than the other axle's for one to be
-    named, and of the weight by which the load of an axle without fault may be wrong.  0.13: 1 fault less is found."""
+    load_error: float = 0.12
+    """Share [1] of the weight by which the loads' sum must be wrong, and of an axle's load by which its left and right
+    must differ more than the other axle's for one to be named; lost zeros and what is carried stay below it."""
     any_load: float = 0.6
     """Wrong share [1] of the weight that nothing carried explains, so that all load cells are wrong.  0.42: 5 sound
     sensors more are named."""
 
-    opposite_share: float = 0.85
-    """Share [1] of significant changes that go the wrong way.  Nearly 1: 7 faults less are found."""
-    opposite_time: float = 4.0
-    """Time [s] of significant changes, one after the other: at the border of a soft soil a driver who lifts the
-    implement may pull less and drive more for a moment."""
-
-    scale_time: float = 3.0
-    """Time [s] over which changes of speed and acceleration are compared.  2.1 s: 1 sound sensor more is named, 3.9 s:
-    1 fault less is found."""
-    min_speed_rms: float = 0.06
-    """Rms [m/s] of the changes of speed that there must be.  0.08: 1 sound sensor less is named."""
-    sure_correlation: float = 0.985
-    """Correlation [1] of the two at the best delay, at least.  0.69: 4 faults more and 1 sound sensor more; nearly 1:
-    14 faults less."""
-    possible_correlation: float = 0.9
-    """Correlation [1] at another delay from which that delay is possible too; minus it at most, changes are opposite.
-    0.63: 3 faults less; nearly 1: 88 sound sensors more are named."""
-    known_share: float = 0.9
-    """Share [1] of bins with both.  Nearly 1: 14 faults less are found."""
+    comparison_time: float = 3.0
+    """Time [s] over which changes of two quantities are compared: at the border of a soft soil a driver who lifts the
+    implement may pull less and drive more for a moment.  2.1 s: 1 sound sensor more is named, 3.9 s: 1 fault less is
+    found."""
+    usual_share: float = 0.9
+    """Share [1] of these changes that must be known, and of significant ones that go the wrong way.  Nearly 1: 22
+    faults less are found."""
+    correlation: float = 0.985
+    """Correlation [1] from which speed and acceleration go together at some delay.  Nearly 1: 15 faults less are
+    found."""
     scale_ratio: float = 1.35
     """Ratio [1] of their changes from which they contradict each other.  1: 85 sound sensors more are named; 1.76: 14
     faults less are found."""
-    max_delay: float = 0.6
-    """Greatest delay [s] between speed and acceleration.  30 % either way finds the same faults."""
     jump_explained: float = 0.25
     """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
     fifteen faults of the accelerometer are taken for jumps (`validation.sensitivity`)."""
