@@ -18,14 +18,10 @@ class ReceptionOptions:
     """Which samples are outliers, how short bins are, and which windows have data enough."""
 
     outlier_sd: float = 6.5
-    """Distance from the line [sd of the sensor] from which a sample may be an outlier."""
+    """Distance from the line [sd] from which a sample may be an outlier, by the sensor's noise and by the channel's own
+    scatter, which is more where it vibrates or its noise is set too low."""
     quartile_distances: float = 3.0
     """Distances of the quartiles around a sample [1] that it may always lie off: in steps and bumps real signals do."""
-    vibrating_sd: float = 1.5
-    """A channel that scatters by more than this [sd of the sensor] vibrates, or its noise is set too low: it is judged
-    by its own scatter."""
-    vibrating_outlier_sd: float = 8.0
-    """Distance from the line [sd of that scatter] from which a sample of such a channel is an outlier."""
     max_loss: float = 0.1
     """Share [1] of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise."""
 

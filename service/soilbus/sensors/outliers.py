@@ -1,12 +1,12 @@
 """Single outliers: readings that fit neither their noise nor the readings around them.
 
-    outlier    |y - line(t)| > max(a sd, b q, c sd_v)     a, b, c: outlier_sd, quartile_distances, vibrating_outlier_sd
+    outlier    |y - line(t)| > max(a sd, a sd_v, b q)     a, b: outlier_sd, quartile_distances
 
 The line joins the medians of the four samples before and of the four after (Hampel identifier with the trend taken out;
-cf. Davies & Gather, J. Am. Stat. Assoc. 88, 1993, 782-792).  sd is the sensor's noise, q the distance of the quartiles
-of the nine samples less their trend, sd_v the channel's own scatter where it vibrates.  q and sd_v widen the limit in
-steps, bends and vibration, so that only one or two samples that stand out alone are outliers.  Longer runs, frozen
-sensors and offsets are found by `consistency` or by the fit of the model.
+cf. Davies & Gather, J. Am. Stat. Assoc. 88, 1993, 782-792).  sd is the sensor's noise, sd_v the channel's own scatter,
+q the distance of the quartiles of the nine samples less their trend.  sd_v and q widen the limit in vibration, steps
+and bends, so that only one or two samples that stand out alone are outliers.  Longer runs, frozen sensors and offsets
+are found by `consistency` or by the fit of the model.
 """
 
 from __future__ import annotations
@@ -89,10 +89,8 @@ def outlier_test(samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION
     far = far[count[column[far]] >= SPAN]
     if len(far):
         limit = options.quartile_distances * _spread(t, value, line[far], slope[far])
-        vibration = _vibration(value, noise, end - count, end, column[far])
-        vibrating = vibration > options.vibrating_sd
-        by_scatter = np.where(vibrating, options.vibrating_outlier_sd * vibration, 0.0) * noise[far]
-        np.maximum(limit, by_scatter, out=limit)
+        scatter = _vibration(value, noise, end - count, end, column[far]) * noise[far]
+        np.maximum(limit, options.outlier_sd * scatter, out=limit)
         outlier[far] = off[far] > limit
     return Tested(samples, outlier, later)
 
