@@ -60,7 +60,6 @@ from soilbus.terra.wheel import (
     sinkage,
     wheel_forces,
     wheel_forces_and_derivatives,
-    wheel_forces_and_slopes,
 )
 
 RESIDUAL = 0
@@ -826,39 +825,7 @@ class ObservationModel(Measurements):
         angle = entry_angle_for_load(latents.load.ravel(), state, self.model, tolerance=tolerance)
         angle = angle.reshape(self.n, self.n_wheels)
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
-        solved = Latents(latents.load, latents.speed, latents.ground_speed, angle)
-        return self._rolled(solved, soil) if self.rolls.any() else solved
-
-    def _rolled(self, latents: Latents, soil: Soil) -> Latents:
-        """The latents with the speeds and entry angles at which free wheels carry their loads without torque, nearly.
-
-        Newton's method in entry angle and slip, for load and torque; each linearisation adds a step.
-        """
-        free, options = self.rolls, self.options.measurements
-        radius, width, load = self.rig.radius[free], self.rig.width[free], latents.load[:, free]
-        state = WheelState(
-            latents.entry_angle[:, free], 1.0 - latents.ground_speed[:, None] / (radius * latents.speed[:, free]),
-            radius, width, lumped_modulus(soil.k_c, soil.k_phi, width), soil.n, np.tan(soil.phi), soil.c, soil.K,
-        )  # fmt: skip
-        for _ in range(4):
-            (carried, _, torque), ((slope, load_by_slip), _, (by_angle, by_slip)) = wheel_forces_and_slopes(
-                state, self.model
-            )
-            short, last = load - carried, state
-            slip = rolling_step(
-                state.slip, torque + by_angle / slope * short, by_slip - by_angle / slope * load_by_slip,
-                options.max_rolling_skid,
-            )  # fmt: skip
-            short -= load_by_slip * (slip - state.slip)
-            factor = np.clip(1.0 + short / slope / state.entry_angle, 0.8, 1.25)
-            state = state._replace(entry_angle=np.minimum(state.entry_angle * factor, MAX_ENTRY_ANGLE), slip=slip)
-            is_load = np.abs(short) <= options.load_tolerance * load
-            if (is_load & (np.abs(slip - last.slip) <= options.load_tolerance * np.abs(slip))).all():
-                break
-        speed, angle = latents.speed.copy(), latents.entry_angle.copy()
-        speed[:, free] = latents.ground_speed[:, None] / (radius * (1.0 - state.slip))
-        angle[:, free] = state.entry_angle
-        return Latents(latents.load, speed, latents.ground_speed, angle)
+        return Latents(latents.load, latents.speed, latents.ground_speed, angle)
 
     def thinned(self, max_instants: int) -> ObservationModel:
         """The same window with at most `max_instants` of its usable instants, evenly spread."""
