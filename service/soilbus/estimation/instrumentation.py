@@ -414,12 +414,10 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
         if row.kind == "channel":
             speed[:, i], variance[:, i] = window.speed[:, row.at], window.variance["speed"][:, row.at]
         elif row.kind == "coupling":
-            relative = np.where(_locked(window, given.couplings[row.at]), options.shaft_sd, 2.0 * options.slip_sd)
+            relative = np.where(_locked(window, given.couplings[row.at]), 0.0, 2.0 * options.slip_sd)
             size = np.abs(np.array(row.weight)) @ np.nan_to_num(rolling).T / 2.0
             variance[:, i] = (relative * size) ** 2
-        elif row.kind == "same":
-            variance[:, i] = (options.shaft_sd * np.nan_to_num(rolling[:, row.at])) ** 2
-        else:
+        elif row.kind != "same":  # what turns together has no difference
             speed[:, i] = rolling[:, row.at]
             variance[:, i] = (options.slip_sd * rolling[:, row.at]) ** 2
     return _solved(given.speed, speed), speed.copy(), variance
