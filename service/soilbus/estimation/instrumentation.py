@@ -243,7 +243,7 @@ def completed(window: Window, rig: Rig) -> Window:
         return window
     load, load_of, load_var, by_inertia, by_draft = _loads(window, rig, given)
     speed, speed_of, speed_var = _speeds(window, rig, given)
-    torque, torque_of, torque_var = _torques(window, rig, given, load)
+    torque, torque_of, torque_var = _torques(window, given)
     observations = Observations(
         torque_of,
         torque_var,
@@ -423,10 +423,10 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
     return _solved(given.speed, speed), speed.copy(), variance
 
 
-def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> tuple[Array, Array, Array]:
+def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Array]:
     """Torques of the wheels, observations of them and their variances, each (N, W); nan where a row says nothing."""
     torque, shares = _torque_readings(window, given), _shares(window, given)
-    variance, grip = np.zeros_like(torque), zero_if_unknown(load) * rig.radius
+    variance = np.zeros_like(torque)
     for i, row in enumerate(given.torque):
         if row.kind == "channel":
             variance[:, i] = window.variance["torque"][:, row.at]
@@ -434,7 +434,7 @@ def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> t
             variance[:, i] = np.nan
         else:
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
-            size = np.abs(zero_if_unknown(shares)) @ weight + rig.options.measurements.min_torque_share * grip @ weight
+            size = np.abs(zero_if_unknown(shares)) @ weight
             variance[:, i] = np.where(_may_be_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
     return shares, np.where(np.isfinite(variance), torque, np.nan), variance
 

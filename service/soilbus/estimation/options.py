@@ -56,9 +56,6 @@ class MeasurementOptions:
     slip_sd: float = 0.1
     """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is measured.
     With 0.07 and 0.13 a pressure moves by 0.9 and 0.1 sd at most."""
-    min_torque_share: float = 0.05
-    """Torque over load and radius [1] that a differential's friction counts at least, and that of a coasting vehicle.
-    30 % either way moves no simulated window."""
 
 
 @dataclass(frozen=True, slots=True)
