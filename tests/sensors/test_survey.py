@@ -340,6 +340,24 @@ def test_messages_that_never_come_are_named_once_each_with_their_keys(clay_drive
     assert f"{frame_id:#x}" in found.faults[0]
 
 
+@pytest.mark.parametrize("change", [0x04000000, 0x0000000F], ids=["priority", "source"])
+def test_a_message_from_another_sender_than_in_the_dbc_is_named_with_its_identifier(change, clay_drive):
+    config = reference_configuration()
+    frame_id = load_databases(config).get_message_by_name("WheelLoads").frame_id
+    found = beside(config, [(f[0], f[1] ^ change * (f[1] == frame_id), *f[2:]) for f in clay_drive])
+    (fault,) = found.faults
+    assert f"{frame_id:#x}" in fault
+    assert f"{frame_id ^ change:#x}" in fault
+
+
+def test_a_bus_on_which_all_senders_are_others_than_in_the_dbc_is_told_which(clay_drive):
+    config = reference_configuration()
+    frame_id = load_databases(config).get_message_by_name("WheelLoads").frame_id
+    others = [(f[0], f[1] ^ 0x0F, *f[2:]) for f in clay_drive if f[1] == frame_id]
+    found = beside(config, others)
+    assert any(f"{frame_id ^ 0x0F:#x}" in fault for fault in found.faults)
+
+
 def test_a_log_of_another_bus_is_one_line(clay_drive):
     found = beside(load_config(FIELD), [f for f in clay_drive if f[1] & 0xFFFF00 != 0xFE4900])
     assert len(found.faults) == 1

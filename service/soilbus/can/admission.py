@@ -65,6 +65,11 @@ class Counts:
     error_frames: int = 0
     clock_steps: int = 0
 
+    def unknown_of_group(self, arbitration_id: int) -> list[int]:
+        """Identifiers of `unknown_ids`, without bit 31, of the parameter group of a 29-bit one; smallest first."""
+        unknown = (key & ~_EXTENDED for key in self.unknown_ids if key & _EXTENDED)
+        return sorted(identifier for identifier in unknown if pgn_of(identifier) == pgn_of(arbitration_id))
+
 
 class Admission:
     """Collects frames and hands out admitted samples.

@@ -22,10 +22,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from cantools.database.can import Database
+from cantools.database.can import Database, Message
 
 from soilbus.arrays import Array, Mask
-from soilbus.can.admission import Admission
+from soilbus.can.admission import Admission, Counts
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of
@@ -39,6 +39,10 @@ from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
+
+MAX_LISTED = 4
+"""Identifiers that one line names."""
+OTHER_SENDER = "another priority or source address than in the DBC?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,10 +232,11 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
     admission = Admission(channels, database, checked_messages(config, database))
     longest, refused, n = longest_part(admission, frames)
     seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
+    absent = list(_absent(seen, database, admission.counts))
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
-        return Survey(seen, (Finding(text, True),), ())
-    findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database))]
+        return Survey(seen, (Finding(text, True), *(f for f in absent if OTHER_SENDER in f.text)), ())
+    findings = [*absent, *(f for s in seen for f in _of_one(s, database))]
     findings += [*_stuck_and_jagged(seen, longest, config), *_mixed_rates(seen, config)]
     facts = _facts(with_motors, mapped, longest, database)
     open_questions = [f"{s.channel.key}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
@@ -338,14 +343,24 @@ _REFUSAL: Mapping[Reason, str] = {
 }
 
 
-def _absent(seen: Iterable[Seen], database: Database) -> Iterator[Finding]:
+def _absent(seen: Iterable[Seen], database: Database, counts: Counts) -> Iterator[Finding]:
     """Messages without which nothing can be estimated, and that never came."""
     missing = [s.channel for s in seen if _is_absent(s) and not _is_optional(s)]
     for name, channels in grouped(missing, lambda channel: channel.message).items():
         message = database.get_message_by_name(name)
         where = f"{'29' if message.is_extended_frame else '11'}-bit identifier {message.frame_id:#x}"
         keys = ", ".join(channel.key for channel in channels)
-        yield Finding(f"{keys}: no frame of {name} ({where}) was heard", True, tuple(c.name for c in channels))
+        text = f"{keys}: no frame of {name} ({where}) was heard{_elsewhere(message, counts)}"
+        yield Finding(text, True, tuple(c.name for c in channels))
+
+
+def _elsewhere(message: Message, counts: Counts) -> str:
+    """What was heard of a message's parameter group under other identifiers."""
+    heard = counts.unknown_of_group(message.frame_id) if message.is_extended_frame else []
+    if not heard:
+        return ""
+    shown = ", ".join(f"{identifier:#x}" for identifier in heard[:MAX_LISTED]) + ", ..." * (len(heard) > MAX_LISTED)
+    return f", but {shown} of its parameter group: {OTHER_SENDER}"
 
 
 def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
