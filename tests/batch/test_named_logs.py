@@ -39,6 +39,7 @@ def named(config, tmp_path, monkeypatch):
         "\ufefflog;vehicle;start;driver\r\na.log;V 1;60;Ann\r\n",
         "Log\tVehicle\tSTART\na.log\tV 1\t1970-01-01T02:01:00+02:00\n",
         "log, vehicle, start\n\na.log, V 1, 1970-01-01 00:01\n , ,\n",
+        "log;vehicle;start;place, field, and remarks\na.log;V 1;60;\n",
     ],
 )
 def test_a_manifest_of_any_spreadsheet_is_read(text, named):

@@ -162,6 +162,44 @@ def test_a_table_that_cannot_be_used_gets_one_clear_line(tmp_path, text, complai
     assert str(path) in str(error.value)
 
 
+AS_PLAIN = "bed,load,slip,pull,torque,sink\na,900.5,0.1,20.25,30,0.01\na,1200.125,0.2,-40.5,50,"
+
+
+def with_commas(separator: str) -> str:
+    return AS_PLAIN.replace(",", separator).replace(".", ",")
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (with_commas(";"), "utf-8"), (with_commas("\t"), "utf-16"), (with_commas(";"), "utf-8-sig"),
+        (AS_PLAIN.replace(",", ";"), "utf-8"), (AS_PLAIN.replace(",", "\t"), "utf-8"),
+        (with_commas(";").replace("sink", "sink;Neigung, °; %").replace("0,01", "0,01;0;1") + ";0;1", "cp1252"),
+        ("\n" + AS_PLAIN.replace("sink", "sink,a;b;c;d;e;f;g;h").replace("0.01", "0.01,x") + ",x", "utf-8"),
+    ],
+)  # fmt: skip
+def test_a_spreadsheets_table_is_read_as_the_plain_one(text, encoding, tmp_path):
+    (tmp_path / "plain.csv").write_text(AS_PLAIN)
+    (tmp_path / "t.csv").write_bytes(text.encode(encoding))
+    (plain,) = runs_of(rig(), tmp_path / "plain.csv")
+    (run,) = runs_of(rig(), tmp_path / "t.csv")
+    for quantity in ("t", "load", "torque", "sinkage", "draft", "ground_speed"):
+        np.testing.assert_array_equal(getattr(run.window, quantity), getattr(plain.window, quantity))
+    assert run.window.load[0, 0] == 900.5
+
+
+@pytest.mark.parametrize(
+    "rows",
+    ["1,200;1;2,400;30;1", "1200,5;0.1;20;30;1", "1.200,5;0,1;20;30;1"],
+    ids=["thousands", "both", "thousands and decimals"],
+)
+def test_a_comma_that_may_part_thousands_is_no_decimal_comma(rows, tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text(f"load;slip;pull;torque;sink\n{rows}\n")
+    with pytest.raises(TableError, match="is not a number"):
+        runs_of(rig(), path)
+
+
 def test_files_that_are_no_tables_are_named(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR0 nothing of the kind")
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00")

@@ -22,7 +22,7 @@ from typing import IO, Any
 from soilbus.config.model import Config
 from soilbus.offline import dataset
 from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
-from soilbus.offline.tables import MISSING_CELLS
+from soilbus.offline.tables import MISSING_CELLS, separator_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
@@ -30,8 +30,6 @@ LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
 """Of logs that python-can reads; each may have .gz behind it."""
 TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
-SEPARATORS = ",;\t"
-"""Between the cells of a manifest; a spreadsheet writes semicolons where the comma is in numbers."""
 CAN_CSV_COLUMNS = 7
 """Of a log in the CSV of python-can."""
 
@@ -190,7 +188,7 @@ def _csv_rows(file: IO[bytes]) -> tuple[list[str], list[tuple[int, dict[str, Any
     """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
     with TextIOWrapper(file, newline="", encoding="utf-8-sig") as text:
         first = text.readline()
-        table = csv.reader(chain([first], text), delimiter=max(SEPARATORS, key=first.count), strict=True)
+        table = csv.reader(chain([first], text), delimiter=separator_of(first.lower(), MANIFEST_COLUMNS), strict=True)
         header = [name.strip().lower() for name in next(table, [])]
         if "log" not in header:
             return header, []

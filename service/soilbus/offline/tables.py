@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import csv
 import math
+import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +46,11 @@ RIM_SPEED_RATIO = 100.0
 """Rim speed of the stand-in over the least speed at which slip is judged, so that no slip counts as a standstill."""
 MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "<na>", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
+SEPARATORS = ",;\t"
+"""Between the cells of a table; a spreadsheet writes semicolons or tabs where the comma is in numbers."""
+_DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
+_DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
 """Effects that depend on the true speed, which a table does not hold."""
 OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
@@ -79,7 +87,8 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     Returns
     -------
     One run for each soil bed. A cell that is empty or says nan, NA or null is missing; a row without load or slip is
-    left out and counted.
+    left out and counted. Cells of CSV are separated by commas, semicolons or tabs; beside the latter two numbers may
+    have decimal commas.
 
     Raises
     ------
@@ -269,18 +278,81 @@ def _columns(path: Path, needed: Sequence[str]) -> Columns:
 
 
 def _csv(path: Path, needed: Sequence[str]) -> Columns:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as lines:
-            rows = [row for row in csv.reader(LogLines(lines), strict=True) if row]
-    except (ValueError, csv.Error) as error:
-        raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
+    rows, separator = _csv_rows(path, needed)
     header = [name.strip() for name in rows[0]] if rows else []
     _check_columns(path, header, needed)
     for i, row in enumerate(rows[1:], 1):
         if len(row) != len(header):
             raise TableError(f"{path}: row {i} has {len(row)} cells under a header of {len(header)}")
     places = {name: header.index(name) for name in needed}
-    return {name: [row[place] for row in rows[1:]] for name, place in places.items()}
+    columns = {name: [row[place] for row in rows[1:]] for name, place in places.items()}
+    return columns if separator == "," else _with_points(columns)
+
+
+def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
+    """Rows of a file with cells, and what separates these."""
+    with path.open("rb") as file:
+        is_utf_16 = file.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE)
+    try:
+        try:
+            return _rows_in(path, "utf-16" if is_utf_16 else "utf-8-sig", needed)
+        except UnicodeDecodeError:
+            if is_utf_16:
+                raise
+            return _rows_in(path, "cp1252", needed)  # of spreadsheets on Windows
+    except (ValueError, csv.Error) as error:
+        raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
+
+
+def _rows_in(path: Path, encoding: str, needed: Sequence[str]) -> tuple[list[list[str]], str]:
+    with path.open(newline="", encoding=encoding) as text:
+        lines = LogLines(text)
+        first = next((line for line in lines if line.strip()), "")
+        separator = separator_of(first, needed)
+        rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)
+        return [row for row in rows if row], separator
+
+
+def separator_of(header: str, names: Collection[str]) -> str:
+    """What separates a table's cells.
+
+    Parameters
+    ----------
+    header
+        Its first line.
+    names
+        Of columns that are looked for.
+
+    Returns
+    -------
+    The one of SEPARATORS by which most of the names are columns, of several the most frequent one.
+
+    Examples
+    --------
+    >>> separator_of("log;start, UTC, or none;vehicle", ["log", "vehicle"])
+    ';'
+    """
+
+    def found(separator: str) -> tuple[int, int]:
+        cells = {cell.strip() for row in csv.reader([header], delimiter=separator) for cell in row}
+        return len(cells & set(names)), header.count(separator)
+
+    return max(SEPARATORS, key=found)
+
+
+def _with_points(columns: dict[str, list[str]]) -> dict[str, list[str]]:
+    """The cells with a point in place of each decimal comma.
+
+    A comma is one where no number of the table has a point and some number cannot be one of thousands.
+    """
+    cells = {cell.strip() for column in columns.values() for cell in column}
+    commas = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)]
+    if any(map(_DECIMAL_POINT.fullmatch, cells)) or all(map(_THOUSANDS.fullmatch, commas)):
+        return columns
+    return {
+        name: [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in column]
+        for name, column in columns.items()
+    }
 
 
 def _parquet(path: Path, needed: Sequence[str]) -> Columns:
