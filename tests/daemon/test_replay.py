@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import gzip
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -82,6 +83,34 @@ def test_other_formats_are_read_too(tmp_path: Path) -> None:
     frames = list(read_frames(path))
     assert frames == [frame_of(m) for m in read_log(path)]
     assert [(i, x, bytes(d)) for _, i, x, d, _, _ in frames] == [(0x123, False, bytes([i])) for i in range(5)]
+
+
+ASC = """date Fri Nov 27 10:00:00.000 am 2026
+base hex  timestamps {stamps}
+internal events logged
+   0.000000 1  123             Rx   d 1 00
+   {second} 1  123             Rx   d 1 01
+   {third} 1  123             Rx   d 1 02
+"""
+
+
+def test_stamps_of_an_asc_log_that_are_relative_to_the_event_before_are_refused(tmp_path):
+    log = tmp_path / "x.asc"
+    log.write_text(ASC.format(stamps="relative", second="0.020000", third="0.019000"))
+    for read in (read_frames, read_log):
+        with pytest.raises(LogError, match=f"{re.escape(str(log))}: .*absolute"):
+            list(read(log))
+    log.write_text(ASC.format(stamps="absolute", second="0.020000", third="0.040000"))
+    assert [frame[0] for frame in read_frames(log)] == pytest.approx([0.0, 0.02, 0.04])
+
+
+def test_a_byte_order_mark_before_a_log_is_no_part_of_it(tmp_path):
+    log = tmp_path / "x.log"
+    for text in ("(1.500000) can0 123#00\n(1.520000) can0 123#01\n", "(1.500000) can0 123##000\n"):
+        log.write_text(text)
+        frames = list(read_frames(log))
+        log.write_text("\ufeff" + text, encoding="utf-8")
+        assert list(read_frames(log)) == frames
 
 
 @pytest.mark.parametrize("bin_length", [0.1, 0.25, 0.5])

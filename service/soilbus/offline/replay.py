@@ -72,7 +72,7 @@ def read_log(path: Path) -> Iterator[can.Message]:
     LogError
         The file is missing, of an unknown format, or damaged.
     """
-    return chain.from_iterable(_read(path, lambda reader: ([whole(message)] for message in reader)))
+    return chain.from_iterable(_read(path, lambda reader: ([whole(message)] for message in _timed(reader))))
 
 
 def read_frames(path: Path) -> Iterator[Frame]:
@@ -83,7 +83,20 @@ def read_frames(path: Path) -> Iterator[Frame]:
 def _frames(reader: Any) -> Iterator[list[Frame]]:
     if isinstance(reader, can.CanutilsLogReader):
         return candump_batches(reader.file)
-    return ([frame_of(whole(message))] for message in reader)
+    return ([frame_of(whole(message))] for message in _timed(reader))
+
+
+def _timed(reader: Any) -> Iterator[can.Message]:
+    """The messages of a reader; ValueError where an ASC log's stamps only say how long after the last event each came.
+
+    Events between them that are no frames do not come from the reader, so the times cannot be summed up.
+    """
+    last = -math.inf
+    for message in reader:
+        if message.timestamp < last and getattr(reader, "timestamps_format", None) == "relative":
+            raise ValueError("its stamps are relative to the event before: save it with absolute ones")
+        last = message.timestamp
+        yield message
 
 
 def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[list[_T]]:
