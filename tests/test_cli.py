@@ -417,6 +417,21 @@ def test_a_number_that_cannot_be_is_wrong_usage(words, capsys):
     assert "is not a number from" in lines(capsys)[1][-1]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["replay", "x.log", "--table", "a.csv", "--table", "b.parquet"],
+        ["init", "--dbc", "a.dbc", "--dbc", "b.dbc", "--log", "a.log", "--log", "b.log"],
+        ["simulate", "--log", "a.log", "--seed", "1", "--seed", "1"],
+    ],
+)
+def test_an_option_that_may_stand_once_is_not_dropped_where_it_stands_twice(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2
+    assert f"{words[-2]}: given twice" in capsys.readouterr().err
+
+
 def test_a_test_rig_has_no_bus_and_no_drive(capsys):
     rig = FIELD.parents[2] / "service/docs/notebooks/rig.toml"
     table = str(rig.with_name("rig.csv"))

@@ -9,6 +9,7 @@ import argparse
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from soilbus import __version__
 
@@ -41,6 +42,24 @@ def counted(text: str) -> int:
     if number == 0:
         raise argparse.ArgumentTypeError("0 is not enough")
     return number
+
+
+class Once(argparse.Action):
+    """Keeps the value of an option that may stand once: of two outputs or logs, argparse would drop the first."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Set the value; the parser's error where the option has one already."""
+        given: set[str] = vars(namespace).setdefault("given", set())
+        if self.dest in given:
+            parser.error(f"argument {'/'.join(self.option_strings)}: given twice")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
 
 
 EXAMPLES: Mapping[str, str] = {
@@ -86,6 +105,7 @@ def command_line() -> argparse.ArgumentParser:
             name, help=text, description=text, epilog=f"example:\n  {EXAMPLES[name]}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )  # fmt: skip
+        sub.register("action", None, Once)
         if config:
             default = "soilbus.toml in this folder" if config == "found" else "the simulated tractor"
             sub.add_argument(
