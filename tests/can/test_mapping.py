@@ -309,7 +309,10 @@ def test_field_vehicle() -> None:
         ("MN", "force", 1e6),
         ("mN", "force", 1e-3),
         *((s, "rotation", 1.0) for s in ("rad/s", "Rad/s", "rad·s⁻¹", "rad s^-1")),
-        *((s, "rotation", math.pi / 30.0) for s in ("rpm", "1/min", "r/min", "min⁻¹", "min-1", "RPM")),
+        *(
+            (s, "rotation", math.pi / 30.0)
+            for s in ("rpm", "1/min", "r/min", "min⁻¹", "min-1", "RPM", "U/min", "tr/min")
+        ),
         *((s, "rotation", math.pi / 180.0) for s in ("deg/s", "°/s")),
         ("N", "force", 1.0),
         ("kN", "force", 1e3),

@@ -192,6 +192,14 @@ VORN = [
     (432, "Radlast", {"Radlast_HL": "kN", "Radlast_HR": "kN"}),
     (448, "Fahrdyn", {"Laengsbeschl": "m/s^2", "Nickwinkel": "deg", "Zugkraft": "daN", "Radar_Geschw": "km/h"}),
 ]
+PLURALS = [
+    (256, "Antrieb_VL", {"Drehmoment": "Nm", "Drehzahl": "1/min"}),
+    (257, "Antrieb_VR", {"Drehmoment": "Nm", "Drehzahl": "1/min"}),
+    (272, "Raddrehzahlen", {"Rad_VL": "U/min", "Rad_VR": "U/min"}),
+    (288, "Radlasten", {"VL": "N", "VR": "N"}),
+    (304, "Achslasten", {"Hinten": "N"}),
+]
+"""Without a word of motor or wheel in a signal's own name."""
 LETTERS = [
     (529, "MCU_F_Tq", {"MCU_F_TqEst": "Nm", "MCU_F_TqReq": "Nm", "MCU_F_TqMaxAvl": "Nm"}),
     (530, "MCU_R_Tq", {"MCU_R_TqEst": "Nm", "MCU_R_TqReq": "Nm", "MCU_R_TqMaxAvl": "Nm"}),
@@ -226,6 +234,15 @@ def test_names_in_german_are_found(tmp_path, capsys):
         "wheel.RL.load": "Radlast.Radlast_HL", "wheel.RR.load": "Radlast.Radlast_HR",
         "signals.acceleration": "Fahrdyn.Laengsbeschl", "signals.pitch": "Fahrdyn.Nickwinkel",
         "signals.draft": "Fahrdyn.Zugkraft", "signals.ground_speed": "Fahrdyn.Radar_Geschw",
+    }  # fmt: skip
+
+
+def test_german_messages_in_the_plural_say_what_their_signals_are(tmp_path, capsys):
+    found = mapped(proposed(capsys, a_dbc(tmp_path / "plurals.dbc", PLURALS)))
+    assert found == {
+        "wheel.FL.torque": "Antrieb_VL.Drehmoment", "wheel.FR.torque": "Antrieb_VR.Drehmoment",
+        "wheel.FL.speed": "Raddrehzahlen.Rad_VL", "wheel.FR.speed": "Raddrehzahlen.Rad_VR",
+        "wheel.FL.load": "Radlasten.VL", "wheel.FR.load": "Radlasten.VR", "axle.rear.load": "Achslasten.Hinten",
     }  # fmt: skip
 
 

@@ -75,8 +75,10 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
 }  # fmt: skip
 _GERMAN: Mapping[str, str] = {
-    "torque": "moment mom drehmoment drehmom", "speed": "drehzahl drehz geschwindigkeit geschw raddrehzahl raddrehz",
-    "motor": "asm psm", "wheel": "raddrehzahl raddrehz radlast", "axle": "achse achslast", "load": "radlast achslast",
+    "torque": "moment mom drehmoment drehmom",
+    "speed": "drehzahl drehz geschwindigkeit geschw raddrehzahl raddrehz raddrehzahlen",
+    "motor": "asm psm antrieb", "wheel": "raddrehzahl raddrehz raddrehzahlen radlast radlasten",
+    "axle": "achse achslast achslasten", "load": "radlast radlasten achslast achslasten",
     "draft": "zugkraft", "force": "kraft", "pitch": "nick nickwinkel", "roll": "wank wankwinkel",
     "yaw": "gier gierrate", "rate": "gierrate", "acceleration": "beschleunigung beschl laengsbeschl querbeschl",
     "longitudinal": "laengs laengsbeschl", "lateral": "quer querbeschl", "steering": "lenk lenkwinkel",

@@ -34,8 +34,11 @@ _SPELLINGS: dict[tuple[str, float], str] = {
     ("torque", 1e-2): "ncm n.cm n*cm",
     ("torque", 1.3558179483314004): "lbft lbfft lbf.ft lb.ft ftlb ft.lb ft.lbf",
     ("rotation", 1.0): "rad/s rad/sec rad.s-1 rads-1",
-    ("rotation", 2.0 * math.pi): "rev/s r/s rps turns/s",
-    ("rotation", math.pi / 30.0): "rpm 1/min r/min rev/min u/min min-1 /min rot/min",
+    ("rotation", 2.0 * math.pi): "rev/s r/s rps turns/s u/s tr/s",
+    (
+        "rotation",
+        math.pi / 30.0,
+    ): "rpm 1/min r/min rev/min u/min min-1 /min rot/min tr/min tr/mn giri/min obr/min ot/min",
     ("rotation", math.pi / 180.0): "deg/s deg/sec °/s degree/s degrees/s",
     ("force", 1.0): "n newton newtons",
     ("force", 10.0): "dan",
