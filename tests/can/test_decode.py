@@ -138,6 +138,18 @@ def test_nested_multiplexers_equal_cantools(rows: list[bytes]) -> None:
     assert_equal_to_cantools(message, rows)
 
 
+@pytest.mark.parametrize(("order", "start"), [("little_endian", 32), ("big_endian", 39)])
+@pytest.mark.parametrize("length", [8, 16, 13, 32])
+@pytest.mark.parametrize("others", [{"scale": 0.1}, {"scale": 2}, {"offset": 7}, {"scale": -2, "offset": 0.3}])
+def test_signals_that_take_turns_in_the_same_place_have_each_its_own_scale(order, start, length, others) -> None:
+    pages = [
+        signal(f"S{i}", start, length, byte_order=order, multiplexer_ids=[i], multiplexer_signal="Page", **scale)
+        for i, scale in enumerate(({"scale": 0.5}, others, {}))
+    ]
+    message = Message(0x100, "M", 8, [signal("Page", 0, 8, is_multiplexer=True), *pages])
+    assert_equal_to_cantools(message, [bytes([page, 0, 0, 0, 249, 18, 52, 86]) for page in range(3)])
+
+
 def test_scaled_multiplexer_selects_by_its_physical_value() -> None:
     mux = signal("Mux", 0, 4, scale=2, is_multiplexer=True)
     child = signal("Child", 8, 8, multiplexer_ids=[4], multiplexer_signal="Mux")

@@ -9,6 +9,7 @@ share the same eight bytes by two shifts for all of them.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -183,7 +184,9 @@ def _presence(signal: Signal, columns: dict[str, SignalColumn]) -> NDArray[np.bo
 
 
 def _groups(length: int, signals: list[Signal]) -> list[_Group]:
+    """The signals in groups; of several in the same lane (multiplexed ones) each in another group, with its scale."""
     sorted_in: dict[tuple[Any, ...], list[Signal]] = {}
+    in_lane: Counter[tuple[Any, ...]] = Counter()
     for signal in signals:
         place, _ = _place(signal, length)
         is_float = bool(signal.conversion.is_float)
@@ -191,7 +194,9 @@ def _groups(length: int, signals: list[Signal]) -> list[_Group]:
         if kind == "row" or signal.length == 64:
             key: tuple[Any, ...] = (signal.name,)
         elif _lane(signal, length) is not None:
-            key = (signal.length, signal.byte_order, signal.is_signed, kind)
+            lanes = signal.length, signal.byte_order, signal.is_signed, kind
+            key = (*lanes, in_lane[*lanes, signal.start])
+            in_lane[*lanes, signal.start] += 1
         else:
             key = (place, signal.is_signed, kind)
         sorted_in.setdefault(key, []).append(signal)
