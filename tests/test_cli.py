@@ -21,6 +21,7 @@ from can.interfaces.virtual import VirtualBus
 from soilbus.cli.main import main
 from soilbus.config.file import load_config
 from soilbus.config.model import ConfigError
+from soilbus.simulator.reference import TRACTOR
 
 FIELD = Path(__file__).resolve().parent / "field/field.toml"
 
@@ -166,6 +167,14 @@ def test_a_driven_wheel_without_speed_is_a_fault(tmp_path, capsys):
     err = lines(capsys)[1]
     assert len(err) == 1
     assert "wheel FL has no speed: map wheel.FL.speed or axle.front.motor_speed" in err[0]
+
+
+def test_a_byte_order_mark_before_a_configuration_is_no_part_of_it(tmp_path, capsys):
+    assert main(["check", "--config", str(TRACTOR)]) == 0
+    plain = lines(capsys)
+    (tmp_path / "c.toml").write_bytes(b"\xef\xbb\xbf" + TRACTOR.read_bytes())
+    assert main(["check", "--config", str(tmp_path / "c.toml")]) == 0
+    assert lines(capsys) == plain
 
 
 @pytest.mark.parametrize("value", ["[" * 2000 + "]" * 2000, "{a=" * 2000 + "1" + "}" * 2000, "9" * 5000])

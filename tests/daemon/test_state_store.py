@@ -255,6 +255,19 @@ def test_the_wiring_is_in_the_key_down_to_the_bit():
     assert owner_of(database=database).key != OWNER.key
 
 
+def test_the_page_of_a_multiplexed_signal_is_in_the_key():
+    config = reference_configuration()
+    database = copy.deepcopy(load_databases(config))
+    channel = channels_of(config, database)[0]
+    signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
+    signal.multiplexer_signal = "State"
+    keys = set()
+    for pages in ([1], [2]):
+        signal.multiplexer_ids = pages
+        keys.add(owner_of(database=database).key)
+    assert len(keys | {OWNER.key}) == 3
+
+
 @pytest.mark.parametrize("setting", ["bus.channel=can7", "traversability.margin=0.2", "output.dbc=soilbus.dbc"])
 def test_what_a_belief_does_not_depend_on_is_not(setting):
     assert owner_of([setting]).key == OWNER.key

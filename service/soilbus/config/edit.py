@@ -39,7 +39,7 @@ def with_effects_text(
         As load_config().
     """
     config = load_config(path, overrides)
-    document = overridden(tomlkit.parse(path.read_text(encoding="utf-8")), overrides)
+    document = overridden(tomlkit.parse(path.read_text(encoding="utf-8-sig")), overrides)
     if "model" not in document:
         document["model"] = tomlkit.table()
     document["model"]["effects"] = _array(effects, notes)

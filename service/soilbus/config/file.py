@@ -56,7 +56,7 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
     """
     path = Path(path)
     try:
-        raw = tomllib.loads(read_bounded(path, MAX_FILE_BYTES, regular=False).decode())
+        raw = tomllib.loads(read_bounded(path, MAX_FILE_BYTES, regular=False).decode("utf-8-sig"))
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
     except (ValueError, RecursionError) as error:

@@ -290,6 +290,7 @@ def _wiring(channel: Channel, database: Database) -> list[Any]:
         channel.name, channel.factor, channel.offset, channel.low, channel.high, list(channel.valid_values),
         message.frame_id, message.is_extended_frame, message.length,
         *([s.start, s.length, s.byte_order, s.is_signed, s.is_float, float(s.scale), float(s.offset)] for s in signals),
+        *([s.multiplexer_signal, s.multiplexer_ids] for s in signals if s.multiplexer_signal is not None),
     ]  # fmt: skip
 
 
