@@ -358,6 +358,21 @@ def test_a_bus_on_which_all_senders_are_others_than_in_the_dbc_is_told_which(cla
     assert any(f"{frame_id ^ 0x0F:#x}" in fault for fault in found.faults)
 
 
+@pytest.mark.parametrize(("first", "second", "is_told"), [(0x11, 0x22, True), (0x11, None, False), (None, 0x22, False)])
+def test_a_standard_message_of_several_senders_of_which_none_is_the_dbcs_is_told(first, second, is_told, clay_drive):
+    """None in place of an address: that of the DBC."""
+    config = reference_configuration()
+    name, _, _ = config.signals.ground_speed.signal.partition(".")
+    frame_id = load_databases(config).get_message_by_name(name).frame_id
+    senders = [frame_id if address is None else frame_id & ~0xFF | address for address in (first, second)]
+    both = [(f[0], i, *f[2:]) for f in clay_drive for i in (senders if f[1] == frame_id else [f[1]])]
+    found = beside(config, both)
+    told = [text for text in found.warnings if "0x11 and 0x22" in text]
+    assert len(told) == is_told
+    assert all("signals.ground_speed" in text for text in told)
+    assert found.faults == []
+
+
 def test_a_log_of_another_bus_is_one_line(clay_drive):
     found = beside(load_config(FIELD), [f for f in clay_drive if f[1] & 0xFFFF00 != 0xFE4900])
     assert len(found.faults) == 1

@@ -64,6 +64,8 @@ class Counts:
     unknown_ids: Counter[int] = field(default_factory=Counter)
     error_frames: int = 0
     clock_steps: int = 0
+    senders: dict[str, set[int]] = field(default_factory=dict)
+    """Source addresses of a message by its name, where several sent it and none of them is the DBC's."""
 
     def unknown_of_group(self, arbitration_id: int) -> list[int]:
         """Identifiers of `unknown_ids`, without bit 31, of the parameter group of a 29-bit one; smallest first."""
@@ -245,6 +247,8 @@ class Admission:
         if inbox.lock is not None:
             heard = _of_locked_source(inbox.lock, good)
             self._refuse_untimed(inbox, len(good) - len(heard), Reason.WRONG_SOURCE)
+            if len(heard) < len(good) and inbox.lock.source != inbox.lock.own:
+                self.counts.senders.setdefault(inbox.message.name, set()).update(source_of(f[1]) for f in good)
             good = heard
         if not good:
             return None

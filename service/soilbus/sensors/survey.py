@@ -236,7 +236,11 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
         return Survey(seen, (Finding(text, True), *(f for f in absent if OTHER_SENDER in f.text)), ())
-    findings = [*absent, *(f for s in seen for f in _of_one(s, database))]
+    findings = [
+        *absent,
+        *_of_several_senders(channels, admission.counts),
+        *(f for s in seen for f in _of_one(s, database)),
+    ]
     findings += [*_stuck_and_jagged(seen, longest, config), *_mixed_rates(seen, config)]
     facts = _facts(with_motors, mapped, longest, database)
     open_questions = [f"{s.channel.key}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
@@ -361,6 +365,18 @@ def _elsewhere(message: Message, counts: Counts) -> str:
         return ""
     shown = ", ".join(f"{identifier:#x}" for identifier in heard[:MAX_LISTED]) + ", ..." * (len(heard) > MAX_LISTED)
     return f", but {shown} of its parameter group: {OTHER_SENDER}"
+
+
+def _of_several_senders(channels: Iterable[Channel], counts: Counts) -> Iterator[Finding]:
+    """Messages that several nodes send, of which none is the one that the DBC names: which one counts is chance."""
+    for name, members in grouped(channels, lambda channel: channel.message).items():
+        if addresses := sorted(counts.senders.get(name, ())):
+            keys = ", ".join(channel.key for channel in members)
+            heard = " and ".join(f"{address:#04x}" for address in addresses)
+            yield Finding(
+                f"{keys}: {name} comes from the source addresses {heard}, and the one heard first counts: put the one"
+                f" that you mean into the identifier of a DBC of your own", False,
+            )  # fmt: skip
 
 
 def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
