@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cantools.database.can import Signal
+from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn
 from soilbus.can.validity import REASONS, in_si, judge_codes, judge_validity, meaning, rule_of
@@ -73,6 +74,30 @@ def reasons(verdict: Any) -> list[Reason | None]:
 )
 def test_codes(s: Signal, expected: dict[Any, Reason | None]) -> None:
     assert verdicts(s, list(expected)) == list(expected.values())
+
+
+@pytest.mark.parametrize("limits", [{}, {"minimum": 0, "maximum": 0}, {"minimum": -125, "maximum": 2**32}])
+@pytest.mark.parametrize(
+    ("length", "expected"),
+    [
+        (8, {250: None, 251: RESERVED, 254: ERROR, 255: NA}),
+        (16, {0xFAFF: None, 0xFB00: RESERVED, 0xFE00: ERROR, 0xFF00: NA}),
+        (32, {0xFAFFFFFF: None, 0xFB000000: RESERVED, 0xFE000000: ERROR, 0xFF000000: NA}),
+    ],
+)
+def test_top_codes_of_a_standard_group_are_no_values_whatever_range_the_dbc_has(limits, length, expected) -> None:
+    """Engine torque of 129 %, in a DBC without ranges, is the code of an error."""
+    channel = Channel("torque", "FL", "Eec1", "Torque", 1.0, 0.0, -math.inf, math.inf)
+    torque = signal(length, offset=-125, **limits)
+    torque.name = "Torque"
+    message = Message(0x0CF00400, "Eec1", 8, [torque], is_extended_frame=True)
+    database = Database([message])
+    for code, reason in expected.items():
+        admission = Admission([channel], database)
+        admission.feed(0.0, message.frame_id, True, code.to_bytes(length // 8, "little").ljust(8, b"\0"))
+        out = admission.take()
+        assert len(out.columns["torque.FL"].t) == (reason is None)
+        assert {why for _, why in out.refused} == ({reason} if reason else set())
 
 
 @settings(derandomize=True, max_examples=200, deadline=None)

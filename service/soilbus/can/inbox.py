@@ -17,7 +17,7 @@ from soilbus.arrays import Mask
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
 from soilbus.can.decode import Block, ColumnDecoder
-from soilbus.can.j1939 import SourceLock, source_of
+from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
 from soilbus.can.plain import PlainPlan, plain_plan
 from soilbus.can.validity import CodeRule, rule_of
 
@@ -87,7 +87,8 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
         raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
     wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
     decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
-    rules = tuple(rule_of(message.get_signal_by_name(c.signal)) for c in channels)
+    is_standard = message.is_extended_frame and pgn_of(message.frame_id) in STANDARD_PGNS
+    rules = tuple(rule_of(message.get_signal_by_name(c.signal), is_standard) for c in channels)
     return Inbox(
         message=message,
         channels=tuple(channels),

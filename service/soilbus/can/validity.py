@@ -67,8 +67,11 @@ class CodeRule:
     special: tuple[tuple[int, Reason], ...]
 
 
-def rule_of(signal: Signal) -> CodeRule:
-    """The rule that a signal's DBC entry implies."""
+def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
+    """The rule that a signal's DBC entry implies.
+
+    `is_standard`: of a parameter group of the standards, where the top codes are no values, whatever the DBC's range.
+    """
     named = tuple((code, reason) for code, name in (signal.choices or {}).items() if (reason := meaning(str(name))))
     if signal.conversion.is_float:
         low, high = _float_range(signal)
@@ -81,6 +84,8 @@ def rule_of(signal: Signal) -> CodeRule:
     elif signal.length >= 8:
         special = {last: Reason.NOT_AVAILABLE}
     bands = None if signal.is_signed else _BANDS.get(signal.length)
+    if is_standard and bands is not None:
+        greatest = min(greatest, bands[0] - 1)
     return CodeRule(least, greatest, False, bands, tuple((special | dict(named)).items()))
 
 
