@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import re
 import threading
@@ -12,6 +13,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from cantools.database.can import Database
 
 from soilbus.can.bus import heard_for
 from soilbus.can.candump import Frame, frame_of
@@ -356,6 +358,26 @@ def test_a_bus_on_which_all_senders_are_others_than_in_the_dbc_is_told_which(cla
     others = [(f[0], f[1] ^ 0x0F, *f[2:]) for f in clay_drive if f[1] == frame_id]
     found = beside(config, others)
     assert any(f"{frame_id ^ 0x0F:#x}" in fault for fault in found.faults)
+
+
+def paged(database: Database, pages: dict[str, list[int]]) -> Database:
+    """The tractor's messages; these signals of MotorFL are there where its Counter is one of `pages`."""
+    found = copy.deepcopy(database)
+    motor = found.get_message_by_name("MotorFL")
+    motor.get_signal_by_name("Counter").is_multiplexer = True
+    for name, ids in pages.items():
+        signal = motor.get_signal_by_name(name)
+        signal.multiplexer_signal, signal.multiplexer_ids = "Counter", ids
+    return found
+
+
+def test_a_page_that_comes_in_turns_is_not_called_slow_and_one_that_never_comes_is_named(clay_drive):
+    config = reference_configuration()
+    found = survey(config, paged(load_databases(config), {"ShaftTorque": [0, 2, 4, 6, 8, 10, 12, 14]}), clay_drive)
+    assert not [text for text in (*found.faults, *found.warnings) if "wheel.FL.torque:" in text]
+    found = survey(config, paged(load_databases(config), {"ShaftTorque": [99]}), clay_drive)
+    (fault,) = [text for text in found.faults if "wheel.FL.torque" in text]
+    assert "MotorFL was heard, but never the page of its multiplexer that holds ShaftTorque" in fault
 
 
 @pytest.mark.parametrize(("first", "second", "is_told"), [(0x11, 0x22, True), (0x11, None, False), (None, 0x22, False)])

@@ -355,7 +355,15 @@ def _absent(seen: Iterable[Seen], database: Database, counts: Counts) -> Iterato
         where = f"{'29' if message.is_extended_frame else '11'}-bit identifier {message.frame_id:#x}"
         keys = ", ".join(channel.key for channel in channels)
         text = f"{keys}: no frame of {name} ({where}) was heard{_elsewhere(message, counts)}"
+        signals = dict.fromkeys(channel.signal for channel in channels)
+        if counts.received[name] and all(_is_of_a_page(message, signal) for signal in signals):
+            text = f"{keys}: {name} was heard, but never the page of its multiplexer that holds {', '.join(signals)}"
         yield Finding(text, True, tuple(c.name for c in channels))
+
+
+def _is_of_a_page(message: Message, signal: str) -> bool:
+    """Whether a multiplexer says which frames hold a signal."""
+    return message.get_signal_by_name(signal).multiplexer_signal is not None
 
 
 def _elsewhere(message: Message, counts: Counts) -> str:
@@ -394,7 +402,8 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
         text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
         yield Finding(text, share > 4.0 * LIMITS.refused, (channel.name,) if share > 4.0 * LIMITS.refused else ())
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
-        due = 1e3 / message.cycle_time * (1.0 - share) if message.cycle_time else 0.0
+        cycle = 0 if _is_of_a_page(message, channel.signal) else message.cycle_time
+        due = 1e3 / cycle * (1.0 - share) if cycle else 0.0
         if seen.rate < LIMITS.rate * due:
             yield Finding(f"{key}: {seen.rate:.3g} values a second, where the DBC says {due:.3g}", False)
         elif seen.rate < LIMITS.least_rate and not _is_optional(seen):
