@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from copy import copy
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +14,7 @@ from cantools.database.can import Database, Message
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
 from soilbus.can.dbc_text import message_names, of_messages
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
+from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
@@ -98,29 +99,47 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
 
 
 def output_database(config: Config) -> Database:
-    """The DBC of the frames that soilbus sends, from the address of [j1939] where there is one.
+    """The messages that soilbus sends, from the address of [j1939] where there is one; the DBC may hold others, too.
 
-    Raises ConfigError where it is missing, not a DBC, or lacks a message of ours.
+    Raises ConfigError where it is missing, not a DBC, or lacks anything of a message of ours.
     """
     name = config.output.dbc
     try:
         database = _read(located(config.folder, name))
-        ours = {m.name for m in _read(shipped_dbc("soilbus.dbc")).messages}
+        ours = {m.name: m for m in _read(shipped_dbc("soilbus.dbc")).messages}
     except OSError as error:
         raise ConfigError([f"output.dbc: {name}: {error.strerror or error}"]) from None
     except Exception as error:
         raise ConfigError([f"output.dbc: {name}: not a DBC file: {one_line(error)}"]) from None
-    missing = sorted(ours - {m.name for m in database.messages})
+    missing = sorted(ours.keys() - {m.name for m in database.messages})
     if missing:
         raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
+    messages = [copy(message) for message in database.messages if message.name in ours]
+    if faults := [fault for message in messages for fault in _unlike(message, ours[message.name])]:
+        raise ConfigError([f"output.dbc: {name}: {fault}" for fault in faults])
     if config.j1939.address is None:
-        return database
-    messages = [copy(message) for message in database.messages]
+        return database if len(messages) == len(database.messages) else _database(messages)
     for message in messages:
         if not message.is_extended_frame:
             raise ConfigError([f"j1939.address: {message.name} in {name} has an identifier of 11 bits, without one"])
         message.frame_id = message.frame_id & ~0xFF | config.j1939.address
     return _database(messages)
+
+
+def _unlike(message: Message, ours: Message) -> Iterator[str]:
+    """What an edited message lacks that is sent in ours, or why it cannot be sent."""
+    signals = {signal.name: signal for signal in message.signals}
+    for signal in ours.signals:
+        if signal.name not in signals:
+            yield f"no signal {message.name}.{signal.name}"
+            continue
+        names = {NOT_AVAILABLE, ERROR, *map(str, (signals[signal.name].choices or {}).values())}
+        if lacks := [str(name) for name in (signal.choices or {}).values() if str(name) not in names]:
+            yield f"no code for {', '.join(lacks)} in the value table of {message.name}.{signal.name}"
+    try:
+        Publisher(_database([message]))
+    except ValueError as error:
+        yield one_line(error)
 
 
 def filters_of(database: Database) -> list[dict[str, Any]]:

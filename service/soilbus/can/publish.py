@@ -88,13 +88,16 @@ def value_codes(signal: Signal) -> ValueCodes:
 
     Without names in the value table, not available is the most negative code of a signed
     signal and all ones of an unsigned one; error is the J1939 code where the range leaves
-    it free, else not available.  Raises ValueError for float signals and for more than 32 bits.
+    it free, else not available.  Raises ValueError for float signals, for more than 32 bits, and for a
+    code that the bits cannot hold.
     """
     if signal.is_float or signal.length > 32:
         raise ValueError(f"{signal.name}: only integer signals up to 32 bits can be sent")
     least = -(1 << signal.length - 1) if signal.is_signed else 0
     greatest = least + (1 << signal.length) - 1
     names = {str(name): int(code) for code, name in (signal.choices or {}).items()}
+    if wide := [name for name, code in names.items() if not least <= code <= greatest]:
+        raise ValueError(f"{signal.name}: {', '.join(wide)} of the value table does not fit into {signal.length} bits")
     not_available = names.get(NOT_AVAILABLE, least if signal.is_signed else greatest)
     lowest, highest = _valid_codes(signal, least, greatest)
     if NOT_AVAILABLE not in names and signal.length >= 8:  # a range of all codes means all but this one
@@ -106,6 +109,14 @@ def value_codes(signal: Signal) -> ValueCodes:
     return ValueCodes(
         lowest, highest, not_available, error, float(signal.scale), float(signal.offset), saturates, names
     )
+
+
+def _codes_of(message: Message, signal: Signal) -> ValueCodes:
+    """`value_codes`, in whose errors the message is named."""
+    try:
+        return value_codes(signal)
+    except ValueError as error:
+        raise ValueError(f"{message.name}.{error}") from None
 
 
 def _valid_codes(signal: Signal, least: int, greatest: int) -> tuple[int, int]:
@@ -171,7 +182,7 @@ def _layout(message: Message) -> _Layout:
     if message.is_multiplexed():
         raise ValueError(f"{message.name}: multiplexed messages cannot be sent")
     by_name = {signal.name: signal for signal in message.signals}
-    codes = {name: value_codes(signal) for name, signal in by_name.items() if name not in (COUNTER, CHECKSUM)}
+    codes = {name: _codes_of(message, signal) for name, signal in by_name.items() if name not in (COUNTER, CHECKSUM)}
     blank = {name: code.not_available for name, code in codes.items()}
     blank |= {name: 0 for name in (COUNTER, CHECKSUM) if name in by_name}
     modulus = 1 << by_name[COUNTER].length if COUNTER in by_name else 0
