@@ -123,14 +123,6 @@ def test_a_descent_ends_at_its_least_value_where_evaluations_are_used_up_or_the_
     assert nowhere.model is None
 
 
-def test_steps_that_turn_back_are_shortened_to_the_optimum_between():
-    """Full steps of |x|^0.6 overshoot to -0.67 x."""
-    notch = OneResidual(lambda x: abs(x) ** 0.6, lambda x: math.copysign(0.6 * abs(x) ** -0.4, x) if x else 1.0)
-    end = minimise(notch, begin(1.0), SolverOptions(step_tolerance=1e-9), 0.0)
-    assert end.termination is Termination.STEP
-    assert end.evaluations < 8
-
-
 @given(st.integers(0, 10_000), st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=4, max_size=4))
 @settings(max_examples=60, deadline=None)
 def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_optimum(seed, sides):

@@ -82,11 +82,6 @@ class SolverOptions:
     `shortening` after each rise, so that a descent does not overshoot for ever."""
     max_rejected: int = 6
     """Rejected steps in a row."""
-    slow_ratio: float = 0.5
-    """Length of a step over that of the last, along it [1], above which steps are extrapolated.  With 0.25 and 0.75 no
-    status of the golden replays moves."""
-    max_extrapolation: float = 8.0
-    """Largest multiple [1] of a full step by extrapolation.  With 3 and 20 no status of the golden replays moves."""
     give_up_above: float = math.inf
     """Value of the objective above which the fit is of no use: set by the caller."""
 

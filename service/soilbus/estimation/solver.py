@@ -481,10 +481,8 @@ def minimise(
     if here is None or lowest is None:
         return Solution(start, start, None, math.nan, 1, Termination.NOT_FINITE)
     evaluations, n_rejected, damping, fraction = 1, 0, options.damping, 1.0
-    max_rise, decrease, last_step, last_fraction = options.max_rise, math.inf, None, 1.0
+    max_rise, decrease = options.max_rise, math.inf
     while (ended := _termination(options, here, last_decrease, decrease, evaluations, n_rejected)) is None:
-        if last_step is not None and fraction == 1.0:
-            fraction = _extrapolation(options, here, last_step, last_fraction)
         new = objective.stepped(here.iterate, here.model, fraction * here.step)
         there = _expanded(objective, new, damping / options.damping_factor)
         evaluations += 1
@@ -494,15 +492,13 @@ def minimise(
                 damping *= options.damping_factor
                 here = _with_step(here.iterate, here.model, damping) or here
             else:
-                fraction = min(fraction, 1.0) * options.shortening
+                fraction *= options.shortening
             if n_rejected == 2:  # they were predicted
                 here = _expanded(objective, objective.with_entry_angles(here.iterate), damping) or here
                 evaluations += 1
-            last_step = None
             continue
         last_decrease = here.decrease if fraction == 1.0 and not damping else 0.0
         decrease = (here.value - there.value) / (here.value + 1.0)
-        last_step, last_fraction = None if damping else here.step, fraction
         if decrease < 0.0:
             max_rise *= options.shortening
         here, n_rejected = there, 0
@@ -513,20 +509,6 @@ def minimise(
         here = lowest
     end = objective.stepped(here.iterate, here.model, here.step)
     return Solution(end, here.iterate, here.model, here.decrease, evaluations, ended)
-
-
-def _extrapolation(
-    options: SolverOptions, here: _Expansion[PointT, ModelT], last_step: Array, last_fraction: float
-) -> float:
-    """Multiple of a full step to take, from the last one (F + A,) and the fraction of it that was taken.
-
-    Aitken's extrapolation: above 1 where steps shrink slowly, below 1 where they turn back, else 1.
-    """
-    along = float(last_step @ here.model.information @ here.step) / here.model.squared_length(last_step)
-    ratio = 1.0 - (1.0 - along) / last_fraction
-    if abs(ratio) <= options.slow_ratio:
-        return 1.0
-    return min(1.0 / max(1.0 - ratio, 1.0 / options.max_extrapolation), options.max_extrapolation)
 
 
 def _expanded(
