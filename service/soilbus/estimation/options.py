@@ -119,11 +119,10 @@ class SearchOptions:
     bound_sd: float = 4.0
     """Bound of a free parameter's logarithm about the prior median [prior sd].  With 3 clay lies at a bound (306 states
     of `replay-clay` are worse), with 6 no status moves."""
-    max_angle_change: float = 0.2
-    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.  With 0.1
-    and 0.4 no status of the golden replays moves."""
-    max_angle_change_with_effects: float = 0.1
-    """The same [1] where effects have a part in the load: they may be curved where the soil alone is not."""
+    max_angle_change: float = 0.1
+    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.  With 0.2
+    no status of the golden replays moves, but an sd of `diagnose-single-hardpan-graded-large` by 5 %: effects may be
+    curved where the soil alone is not."""
     soil_alone: SolverOptions = SolverOptions(
         10, step_tolerance=1.0, decrease_tolerance=0.02, damping=1e-3, max_rise=0.0
     )

@@ -249,8 +249,7 @@ class Objective:
         else:
             new = self.problem.updated(at, latents, *changes)
         change = np.abs(new.entry_angle / latents.entry_angle - 1.0).max(initial=0.0)
-        limits = self.options
-        if change > (limits.max_angle_change_with_effects if len(at.load_by_effects) else limits.max_angle_change):
+        if change > self.options.max_angle_change:
             new = self.problem.with_entry_angles(new, Soil(*soil.tolist()), gains)
         return Iterate(soil, gains, new)
 
