@@ -82,13 +82,6 @@ def test_a_descent_does_not_end_at_a_start_that_may_be_underestimated():
     assert minimise(exponential(), at_optimum, SolverOptions()).evaluations == 2
 
 
-def test_a_descent_converges_where_the_objective_hardly_falls():
-    """The slope is 1e-5 of what the model says."""
-    plain = OneResidual(lambda x: 10.0 - 1e-3 * x, lambda x: -100.0)
-    end = minimise(plain, begin(0.5), SolverOptions(decrease_tolerance=0.02, damping=1e-3, max_rise=0.0))
-    assert end.termination is Termination.DECREASE
-
-
 def test_a_descent_whose_predicted_value_stays_too_high_is_given_up():
     curve = OneResidual(lambda x: 100.0 + 0.0 * x, lambda x: 1e-9)
     end = minimise(curve, begin(0.0), SolverOptions(step_tolerance=0.0, give_up_above=-1.0))
@@ -106,9 +99,6 @@ def test_rejected_steps_are_shortened_and_end_a_descent_that_finds_none():
     assert len(steps) == 4
     assert all(later < 0.5 * step for step, later in pairwise(steps))
     assert cliff.n_solved_angles == 1
-    damped = OneResidual(cliff.residual, cliff.derivative)
-    minimise(damped, begin(0.0), SolverOptions(damping=1.0, max_rejected=3))
-    assert [x for x in damped.tried if x != 0.0] == pytest.approx([10.0 / (1.0 + 10.0**k) for k in range(4)])
 
 
 def test_a_descent_ends_at_its_least_value_where_evaluations_are_used_up_or_the_numbers_are_not_finite():

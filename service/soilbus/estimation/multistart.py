@@ -28,7 +28,7 @@ from soilbus.estimation.model_form import FormPosterior
 from soilbus.estimation.observation_model import CurvedPathFit, ObservationModel, Optimum
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
-from soilbus.estimation.solver import CONVERGED, Iterate, Objective, Solution, Termination, WindowModel, minimise
+from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, WindowModel, minimise
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
@@ -118,7 +118,7 @@ class Fit:
     @property
     def converged(self) -> bool:
         """Whether the descent ended at an optimum."""
-        return self.termination in CONVERGED
+        return self.termination is Termination.STEP
 
     @property
     def gains(self) -> Array:
@@ -290,7 +290,7 @@ def _search(thin: Objective) -> list[_End]:
         end = _end_from(thin, np.asarray(start))
         if end is None:
             continue
-        met = any(abs(end.value - other.value) < options.soil_alone.decrease_tolerance * other.value for other in ends)
+        met = any(abs(end.value - other.value) < options.same_end * other.value for other in ends)
         ends.append(end)
         if met and end.value < options.plausible_chi2 * thin.problem.n_rows:
             break
@@ -385,7 +385,7 @@ def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluation
     inverse = solve_with_inverse(end.model.information, end.model.gradient)
     if inverse is None:
         return None
-    is_converged, previous = end.termination in CONVERGED, end.previous
+    is_converged, previous = end.termination is Termination.STEP, end.previous
     last_decrease = end.predicted_decrease if is_converged else 0.0
     return Fit(
         mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1], previous.soil),

@@ -67,19 +67,12 @@ class SolverOptions:
     step_tolerance: float = 1e-6
     """Squared length of the next step in posterior sd, predicted from the ratio of the last two, from which a descent
     has converged.  With 1e-5, 1 of 100 descents stopped in a curved valley, 0.2 of -2 log too high."""
-    decrease_tolerance: float = 0.0
-    """Decrease of the objective by a step, relative to the objective and one [1], from which a descent has converged;
-    0: none."""
-    damping: float = 0.0
-    """Of the first step, as a share of the diagonal [1].  With 0 steps are not damped but shortened."""
-    damping_factor: float = 10.0
-    """Factor [1] on the damping after a rejected step; its inverse after an accepted one (Marquardt 1963)."""
     shortening: float = 0.4
-    """Factor [1] on the fraction of the step after a rejected step, without damping; 0.3 to 0.5 do the same."""
+    """Factor [1] on the fraction of the step after a rejected step; 0.3 to 0.5 do the same."""
     max_rise: float = 1.0
-    """Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Without damping
-    steps that overshoot in a curved valley return by themselves: 0.2 to 1 do the same.  It is multiplied by
-    `shortening` after each rise, so that a descent does not overshoot for ever."""
+    """Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Steps that
+    overshoot in a curved valley return by themselves: 0.2 to 1 do the same.  It is multiplied by `shortening` after
+    each rise, so that a descent does not overshoot for ever."""
     max_rejected: int = 6
     """Rejected steps in a row."""
     give_up_above: float = math.inf
@@ -90,6 +83,8 @@ class SolverOptions:
 class SearchOptions:
     """Starts of a window's fit, steps of the soil, bounds, and a second mode."""
 
+    same_end: float = 0.02
+    """Relative difference of the objectives [1] below which two descents of the search have met."""
     thinned: int = 24
     """Instants of a window that the search for starts uses.  With 12 and 48 no status of the golden replays moves."""
     plausible_chi2: float = 3.0
@@ -123,11 +118,8 @@ class SearchOptions:
     """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.  With 0.2
     no status of the golden replays moves, but an sd of `diagnose-single-hardpan-graded-large` by 5 %: effects may be
     curved where the soil alone is not."""
-    soil_alone: SolverOptions = SolverOptions(
-        10, step_tolerance=1.0, decrease_tolerance=0.02, damping=1e-3, max_rise=0.0
-    )
-    """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on.  Two
-    ends whose objectives differ by less than its `decrease_tolerance` are one."""
+    soil_alone: SolverOptions = SolverOptions(10, step_tolerance=0.1, max_rise=0.0)
+    """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
     cold: SolverOptions = SolverOptions()
     """Joint descent of soil, gains and latents from there."""
     warm: SolverOptions = SolverOptions(step_tolerance=2e-4)

@@ -195,4 +195,3 @@ class Coordinates:
 def at_bounds(value: Array, low: Array, high: Array) -> Array:
     """1.0 or -1.0 (M,) where a value (M,) is at its upper or lower bound (M,), else 0.0."""
     return np.subtract(value >= high - BOUND_TOLERANCE, value <= low + BOUND_TOLERANCE, dtype=float)
-

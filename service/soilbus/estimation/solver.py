@@ -1,4 +1,4 @@
-"""The solver: minimises a window's -2 log posterior by damped Gauss-Newton steps.
+"""The solver: minimises a window's -2 log posterior by Gauss-Newton steps, shortened where they are rejected.
 
 Equations.  With theta the free soil coordinates and the active gains, r the residuals and W their inverse
 covariance, p the residuals of the prior and P its precision,
@@ -6,7 +6,7 @@ covariance, p the residuals of the prior and P its precision,
     objective     F(theta) = -2 log posterior = r' W r + p' P p + constant
     Jacobian      J = dr/dtheta,   J_p = dp/dtheta
     model         gradient g = J' W r + J_p' P p,   information H = J' W J + J_p' P J_p
-    step          (H + C + damping diag(H + C)) d = -g,   subject to the active bounds
+    step          (H + C) d = -g,   subject to the active bounds
     decrease      of F, predicted for a full step: D = d' H d, its squared length in posterior sd
 
 C is the positive part of the curvature that the coordinates add (parametrization.Coordinates.curvature).
@@ -15,9 +15,8 @@ C is the positive part of the curvature that the coordinates add (parametrizatio
 is the loop: step, evaluate, accept or reject.  `SolverOptions` holds its numbers, `Termination` says why it ended.
 
 The latents (loads and speeds of each instant) are eliminated from the linear model.  In an objective `as_measured`
-they are held, and F is a function of theta; it must fall at each step, and after a rejected one the damping is raised
-(Levenberg-Marquardt).  Otherwise they follow each step as the linear model predicts, one linearisation late, so that F
-may rise before it falls further; after a rejected step a fraction of it is taken.
+they are held, and F is a function of theta that must fall at each step.  Otherwise they follow each step as the linear
+model predicts, one linearisation late, so that F may rise before it falls further.
 """
 
 from __future__ import annotations
@@ -85,15 +84,13 @@ class QuadraticModel:
     neg2_log_posterior: float
     active_bounds: Array
 
-    def step(self, damping: float = 0.0) -> Array | None:
+    def step(self) -> Array | None:
         """The step (F + A,) to the model's minimum within the active bounds; None where there is no minimum.
 
-        `damping` is the share of the diagonal added to it (Levenberg-Marquardt).  A step that would cross an active
-        bound goes along it, to the least value there.
+        A step that would cross an active bound goes along it, to the least value there.
         """
-        curved = self.information + self.curvature
-        curved.flat[:: len(curved) + 1] *= 1.0 + damping
-        solution = _solution(curved, np.concatenate([self.gradient[None], self.active_bounds]).T)
+        right = np.concatenate([self.gradient[None], self.active_bounds]).T
+        solution = _solution(self.information + self.curvature, right)
         if solution is None:
             return None
         step = -solution[:, 0]
@@ -377,8 +374,6 @@ class Termination(StrEnum):
 
     STEP = "step"
     """Converged: the next step is predicted to be shorter than the tolerance."""
-    DECREASE = "decrease"
-    """Converged: the last step lowered the objective by less than the tolerance."""
     LIMIT = "limit"
     """Evaluations are used up."""
     REJECTED = "rejected"
@@ -387,10 +382,6 @@ class Termination(StrEnum):
     """The objective is predicted to stay above a value of interest."""
     NOT_FINITE = "not_finite"
     """The model is not finite, or has no minimum, where the descent begins."""
-
-
-CONVERGED = frozenset({Termination.STEP, Termination.DECREASE})
-"""Terminations of a descent that ended at an optimum."""
 
 
 PointT = TypeVar("PointT")
@@ -440,7 +431,7 @@ class Solution(NamedTuple, Generic[PointT, ModelT]):
 
 
 class _Expansion(NamedTuple, Generic[PointT, ModelT]):
-    """An iterate, the quadratic model there, its step with the present damping and the predicted decrease."""
+    """An iterate, the quadratic model there, its step and the predicted decrease."""
 
     iterate: PointT
     model: ModelT
@@ -470,60 +461,47 @@ def minimise(
     -------
     Solution
     """
-    here = lowest = _expanded(objective, start, options.damping)
+    here = lowest = _expanded(objective, start)
     if here is None or lowest is None:
         return Solution(start, start, None, math.nan, 1, Termination.NOT_FINITE)
-    evaluations, n_rejected, damping, fraction = 1, 0, options.damping, 1.0
-    max_rise, decrease = options.max_rise, math.inf
-    while (ended := _termination(options, here, last_decrease, decrease, evaluations, n_rejected)) is None:
+    evaluations, n_rejected, fraction = 1, 0, 1.0
+    max_rise = options.max_rise
+    while (ended := _termination(options, here, last_decrease, evaluations, n_rejected)) is None:
         new = objective.stepped(here.iterate, here.model, fraction * here.step)
-        there = _expanded(objective, new, damping / options.damping_factor)
+        there = _expanded(objective, new)
         evaluations += 1
         if there is None or not there.value <= here.value + max_rise * (here.value + 1.0):
             n_rejected, last_decrease = n_rejected + 1, 0.0
-            if damping:
-                damping *= options.damping_factor
-                here = _with_step(here.iterate, here.model, damping) or here
-            else:
-                fraction *= options.shortening
+            fraction *= options.shortening
             if n_rejected == 2:  # they were predicted
-                here = _expanded(objective, objective.with_entry_angles(here.iterate), damping) or here
+                here = _expanded(objective, objective.with_entry_angles(here.iterate)) or here
                 evaluations += 1
             continue
-        last_decrease = here.decrease if fraction == 1.0 and not damping else 0.0
-        decrease = (here.value - there.value) / (here.value + 1.0)
-        if decrease < 0.0:
+        last_decrease = here.decrease if fraction == 1.0 else 0.0
+        if there.value > here.value:
             max_rise *= options.shortening
-        here, n_rejected = there, 0
-        damping, fraction = damping / options.damping_factor, min(2.0 * fraction, 1.0)
+        here, n_rejected, fraction = there, 0, min(2.0 * fraction, 1.0)
         if here.value < lowest.value:
             lowest = here
-    if ended not in CONVERGED:
+    if ended is not Termination.STEP:
         here = lowest
     end = objective.stepped(here.iterate, here.model, here.step)
     return Solution(end, here.iterate, here.model, here.decrease, evaluations, ended)
 
 
-def _expanded(
-    objective: Minimisable[PointT, ModelT], iterate: PointT, damping: float
-) -> _Expansion[PointT, ModelT] | None:
+def _expanded(objective: Minimisable[PointT, ModelT], iterate: PointT) -> _Expansion[PointT, ModelT] | None:
     """The quadratic model at an iterate with its step; None where these are not finite."""
     model = objective.quadratic_model(iterate)
-    return None if model is None else _with_step(iterate, model, damping)
-
-
-def _with_step(iterate: PointT, model: ModelT, damping: float) -> _Expansion[PointT, ModelT] | None:
-    step = model.step(damping)
-    return (
-        None if step is None else _Expansion(iterate, model, step, model.squared_length(step), model.neg2_log_posterior)
-    )
+    step = None if model is None else model.step()
+    if model is None or step is None:
+        return None
+    return _Expansion(iterate, model, step, model.squared_length(step), model.neg2_log_posterior)
 
 
 def _termination(
     options: SolverOptions,
     here: _Expansion[PointT, ModelT],
     last_decrease: float | None,
-    decrease: float,
     evaluations: int,
     n_rejected: int,
 ) -> Termination | None:
@@ -533,8 +511,6 @@ def _termination(
     ratio = min(here.decrease / last_decrease, 1.0) if last_decrease else 1.0
     if last_decrease is not None and ratio * here.decrease < options.step_tolerance:
         return Termination.STEP
-    if abs(decrease) < options.decrease_tolerance:
-        return Termination.DECREASE
     if n_rejected > options.max_rejected:
         return Termination.REJECTED
     return Termination.LIMIT if evaluations >= options.max_evaluations else None
