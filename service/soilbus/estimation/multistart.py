@@ -26,7 +26,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.model_form import FormPosterior
 from soilbus.estimation.observation_model import CurvedPathFit, ObservationModel, Optimum
-from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
+from soilbus.estimation.posterior import NORMAL_95, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, WindowModel, minimise
 from soilbus.terra.soils import KINDS, SOILS
@@ -39,8 +39,6 @@ __all__ = [
     "fit_from_soil",
     "fit_window",
 ]
-
-_K_C = PARAMETERS.index("k_c")
 
 
 class SecondMode(NamedTuple):
@@ -326,13 +324,12 @@ def _joint_fit(objective: Objective, end: _End) -> Fit | None:
 def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> Fit:
     """The likelier of an optimum and another one, with the other as its second mode.
 
-    The candidate is an end of the search other than the first, from which `found` was reached, or the soil
-    with k_c's other share.  There is no second mode where its share of the probability is below `min_mode_share`
-    or the one lies in the 95 % interval of the other.
+    The candidate is an end of the search other than the first, from which `found` was reached.  There is no second mode
+    where its share of the probability is below `min_mode_share` or the one lies in the 95 % interval of the other.
     """
     options = objective.options
     has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
-    end = _other_end(objective, thin, found, ends) if has_two_widths else None
+    end = _other_end(thin, found, ends) if has_two_widths else None
     if end is None:
         return found
     other = _joint_fit(objective, end)
@@ -346,12 +343,9 @@ def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: S
     return replace(better, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
 
 
-def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:
-    """The best end of a descent on a few instants that is far from `found`."""
-    options = objective.options
-    is_k_c_open = math.sqrt(found.mode.covariance[_K_C, _K_C]) > options.determined_k_c_sd
-    has_several_ends = len({end.soil.tobytes() for end in ends}) > 1
-    here = thin.quadratic_model(thin.start(found.mode.soil)) if has_several_ends or is_k_c_open else None
+def _other_end(thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:
+    """The best end of a descent on a few instants that is far from `found`, and farther than the nearest end."""
+    here = thin.quadratic_model(thin.start(found.mode.soil)) if len(ends) > 1 else None
     if here is None:
         return None
     position = thin.coordinates.position(found.mode.soil)
@@ -361,14 +355,8 @@ def _other_end(objective: Objective, thin: Objective, found: Fit, ends: Sequence
         off[: len(position)] = thin.coordinates.position(end.soil) - position
         return here.squared_length(off)
 
-    away = options.other_optimum_sd**2
-    least = max(away, min(map(squared_distance, ends)))
-    other = next((end for end in ends[1:] if squared_distance(end) > least), None)
-    start = objective.coordinates.with_other_share(found.mode.soil) if is_k_c_open and other is None else None
-    if start is None:
-        return other
-    end = _end_from(thin, start)
-    return end if end is not None and squared_distance(end) > away else None
+    away = max(thin.options.other_optimum_sd**2, min(map(squared_distance, ends)))
+    return next((end for end in ends[1:] if squared_distance(end) > away), None)
 
 
 def _cold_fit(objective: Objective, near: Solution[Iterate, WindowModel]) -> Fit | None:

@@ -96,9 +96,6 @@ class SearchOptions:
     max_implausible_evaluations: int = 5
     """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
     `replay-bogging` gets an estimate."""
-    determined_k_c_sd: float = 0.6
-    """Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it.  With 0.3
-    no status of the golden replays moves, with 1.2 no value."""
     other_optimum_sd: float = 10.0
     """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
     are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""

@@ -147,28 +147,6 @@ class Coordinates:
             return np.zeros((0, len(sides)))
         return np.asarray((sides[:, None] * self.log_directions(soil)[self.free])[sides != 0.0])
 
-    def with_other_share(self, soil: Array) -> Array | None:
-        """The soil (6,) with the same K_L and a high share of k_c in place of a low one, or the reverse.
-
-        Notes
-        -----
-        The objective is nearly quadratic in k_c, but not in log k_c.  Where k_c is too small to matter only the
-        prior counts, so that there may be one optimum there and another where k_c matters.
-
-        Returns
-        -------
-        (6,) or None
-            None where k_c and k_phi are not both free.
-        """
-        if not {_K_C, _K_PHI} <= self._column.keys():
-            return None
-        K_L = soil[_K_PHI] + soil[_K_C] / self.width
-        low, high = 0.03, 0.4  # on either side of what most windows can distinguish from zero
-        share = low if soil[_K_C] / self.width > math.sqrt(low * high) * K_L else high
-        other = soil.copy()
-        other[_K_C], other[_K_PHI] = share * K_L * self.width, (1.0 - share) * K_L
-        return self.within(other)
-
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
         """Least and greatest values (F,) of the free parameters, in SI."""
