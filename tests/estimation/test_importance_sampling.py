@@ -9,7 +9,6 @@ from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import attainable_variance, error_weights, profile_over_n, with_nested_laplace
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.options import PosteriorOptions
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
@@ -47,7 +46,7 @@ def test_the_average_along_n_has_the_moments_of_the_sampled_posterior(uncertain)
     # In coordinates, where k_phi is replaced by the bearing pressure.
     coordinates = Coordinates(prior, float(problem.rig.width.mean()))
     position = np.array([coordinates.position(soil) for soil in np.exp(found.logs)])
-    of_all, of_k_c = error_weights(found.share, attainable, PosteriorOptions())
+    of_all, of_k_c = error_weights(found.share, attainable)
     mean = of_all @ position
     mean[0] = of_k_c @ position[:, 0]
     std = np.sqrt(found.share @ (position - mean) ** 2)

@@ -119,7 +119,7 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         attainable = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
         averaged = along.top.mode
         if attainable is not None:
-            averaged = _averaged(along.nodes, attainable, coordinates, joint_prior, options)
+            averaged = _averaged(along.nodes, attainable, coordinates, joint_prior)
     is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
@@ -209,8 +209,8 @@ def attainable_variance(along: ProfileOverN, prior: SoilPrior, joint_prior: Gaus
     return np.array(variance)
 
 
-def error_weights(probability: Array, attainable: Array, options: PosteriorOptions) -> tuple[Array, Array]:
-    """Weights of M soils such that the weighted mean has the least error.
+def error_weights(probability: Array, attainable: Array) -> tuple[Array, Array]:
+    """Weights of M soils such that the weighted mean has the least square error in units of the attainable sd.
 
     Parameters
     ----------
@@ -218,8 +218,6 @@ def error_weights(probability: Array, attainable: Array, options: PosteriorOptio
         Of the soils.
     attainable : (M, 2)
         Variance of log k_c and log n that is attainable there.
-    options
-        With the powers of that sd by which an error counts.
 
     Returns
     -------
@@ -227,8 +225,8 @@ def error_weights(probability: Array, attainable: Array, options: PosteriorOptio
         For all coordinates, by the variance of log n: combinations with n that the data determine stay so.
         For log k_c, by its own variance.
     """
-    of_all = probability * attainable[:, _OF_N] ** (-0.5 * options.error_power)
-    of_k_c = probability * attainable[:, _OF_K_C] ** (-0.5 * options.error_power_of_k_c)
+    sd = np.sqrt(attainable)
+    of_all, of_k_c = probability / sd[:, _OF_N], probability / sd[:, _OF_K_C]
     return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
@@ -330,9 +328,7 @@ def _node(objective: Objective, near: Iterate, u: float) -> Node | None:
     return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + held.prior_factor.least_value)
 
 
-def _averaged(
-    nodes: list[Node], attainable: Array, coordinates: Coordinates, joint_prior: Gaussian, options: PosteriorOptions
-) -> Gaussian:
+def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, joint_prior: Gaussian) -> Gaussian:
     """Mean and covariance along n, from the nodes and linear interpolation between them.
 
     On the soils of one ridge a window's attainable sd, attainable (nodes, 2) as variance, differs by up to a
@@ -354,7 +350,7 @@ def _averaged(
     along = position.T @ interpolation
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in gaussians])
     probability = determined * by_confidence + (1.0 - determined) * by_density
-    of_all, of_k_c = error_weights(probability, interpolation.T @ attainable, options)
+    of_all, of_k_c = error_weights(probability, interpolation.T @ attainable)
     mean = along @ of_all
     mean[_K_C] = along[_K_C] @ of_k_c
     off = along - mean[:, None]

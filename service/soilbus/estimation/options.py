@@ -144,11 +144,6 @@ class PosteriorOptions:
     at constant loads (`posterior_forms --seed 178`); longer first steps are not as good there."""
     negligible: float = 9.0
     """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
-    error_power: float = 1.0
-    """Power [1] of the attainable sd of a soil by which an error counts less there.  With 2 the mean square error is
-    least in units of what is attainable on each soil, with 0 that of the logarithm."""
-    error_power_of_k_c: float = 2.0
-    """The same [1] for k_c."""
     gaussian_widening: float = 1.2
     """How much wider [1] than the mode's Gaussian the average along n may be for a posterior to count as one: without
     this limit the windows of a rear-driven tractor, all averaged, make intervals that hold in 54 to 100 % on three
