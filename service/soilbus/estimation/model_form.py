@@ -151,6 +151,6 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
     if found is None:
         return prior
     sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
-    sensitivity[:, free] = -objective.parameter_jacobian(optimum) @ approximation.covariance @ cross.T
+    sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ approximation.covariance @ cross.T
     mean[free], covariance[np.ix_(free, free)] = found
     return FormPosterior(sensitivity, mean, covariance)

@@ -320,16 +320,16 @@ class Objective:
         directions[SOIL, : len(self.free)] = iterate.soil[:, None] * self.coordinates.log_directions(iterate.soil)
         return directions
 
-    def parameter_jacobian(self, optimum: Optimum) -> Array:
+    def parameter_jacobian(self, soil: Array) -> Array:
         """Derivatives (6 + G, F + A) of the soil's logarithms and the gains by coordinates and active gains."""
         jacobian = self._gain_directions[1:].copy()
-        jacobian[:_SOIL, : len(self.free)] = self.coordinates.log_directions(optimum.soil)
+        jacobian[:_SOIL, : len(self.free)] = self.coordinates.log_directions(soil)
         return jacobian
 
     def prior_jacobian(self, optimum: Optimum) -> Array:
         """Derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
         unknowns = np.concatenate([self.free, _SOIL + self.active])
-        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum)[unknowns])
+        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum.soil)[unknowns])
 
     # Gaussians at an optimum
 
@@ -350,9 +350,7 @@ class Objective:
 
     def gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
         """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, linearised at `base`."""
-        free = len(self.free)
-        jacobian = self._gain_directions[1:].copy()
-        jacobian[:_SOIL, :free] = self.coordinates.log_directions(soil if base is None else base)
+        jacobian = self.parameter_jacobian(soil if base is None else base)
         logs = jacobian @ covariance @ jacobian.T
         if base is None:
             return Gaussian(soil, gains, logs)
