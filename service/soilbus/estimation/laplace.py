@@ -345,8 +345,6 @@ def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, jo
     variance_above = _one_sd_above(fine, by_density, attainable[:, _OF_K_C] @ interpolation)
     determined = 1.0 - variance_above / joint_prior.variance_of_k_c(coordinates.prior)
     position = np.array([[*coordinates.position(b.soil), *b.gains[active - _SOIL]] for b in gaussians])
-    unbiased = np.array([_unbiased_k_c(node, joint_prior, coordinates.prior) for node in nodes])
-    position[:, _K_C] += determined * (unbiased - position[:, _K_C])
     along = position.T @ interpolation
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in gaussians])
     probability = determined * by_confidence + (1.0 - determined) * by_density
@@ -397,15 +395,3 @@ def _one_sd_above(fine: Array, probability: Array, value: Array) -> float:
     """A value (M,) on a grid (M,), interpolated one sd above the mean of these probabilities (M,)."""
     mean = float(fine @ probability)
     return float(np.interp(mean + math.sqrt((fine - mean) ** 2 @ probability), fine, value))
-
-
-def _unbiased_k_c(node: Node, joint_prior: Gaussian, prior: SoilPrior) -> float:
-    """log k_c given n whose mean over windows on one soil is that soil's, to second order.
-
-    The model is nearly linear in k_c, so the posterior mean of log k_c is biased downwards, and its mode by
-    less.  With the information as prior density the mean would not be (Hartigan 1965, Ann. Math. Stat. 36:1137):
-    that is half a variance above the mode, in proportion to the window's part of the information on k_c.
-    """
-    variance = node.fit.mode.covariance[_K_C, _K_C]
-    of_window = 1.0 - variance / joint_prior.conditioned_on(_N, node.u).variance_of_k_c(prior)
-    return float(np.log(node.fit.mode.soil[_K_C]) + 0.5 * variance * of_window)
