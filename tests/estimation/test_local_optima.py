@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.multistart import fit_from_soil, fit_window
+from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.sensors.bins import Bins
@@ -21,6 +21,7 @@ from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.validation import local_optima
+from soilbus.validation.windows import fit_from_soil
 
 BOUND_SD = 4.0
 """Prior standard deviations to which a free parameter is confined."""

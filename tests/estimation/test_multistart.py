@@ -7,11 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.estimation.multistart import clip_to_prior, fit_from_soil, fit_warm, fit_window, starting_soils, warm_start
+from soilbus.estimation.multistart import clip_to_prior, fit_warm, fit_window, starting_soils, warm_start
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+from soilbus.validation.windows import fit_from_soil
 
 QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
 

@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 from soilbus.diagnosis.joint_fit import Start, fit_jointly
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import fit_from_soil, fit_window
+from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
@@ -24,6 +24,7 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Termination, minimise
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
+from soilbus.validation.windows import fit_from_soil
 
 BOUND_SD = 4.0
 """Prior standard deviations to which a free parameter is confined."""

@@ -137,7 +137,7 @@ class JointObjective:
         return JointModel(information, of_prior, curvature, gradient, value, np.vstack(bounds), tuple(models))
 
     def stepped(self, iterate: tuple[Iterate, ...], model: JointModel, step: Array) -> tuple[Iterate, ...]:
-        """The iterate of each recording after a step of all coordinates, shortened as the longest change of a soil asks."""
+        """The iterate of each recording after a step of all coordinates, shortened as that of any soil asks."""
         each = list(zip(self.parts, self.columns, iterate, model.parts, strict=True))
         fraction = min(part.step_fraction(step[columns]) for part, columns, *_ in each)
         return tuple(part.stepped(at, of_part, fraction * step[columns]) for part, columns, at, of_part in each)

@@ -1,4 +1,4 @@
-"""Fits of a window: from several starts, from one soil, from a given start, or warm from the window before.
+"""Fits of a window: from several starts, or warm from the window before.
 
 Equations.  A fit is the minimum of the objective of `solver` (chi-square of the whitened residuals plus the
 prior) and the Gaussian there,
@@ -36,7 +36,6 @@ __all__ = [
     "Fit",
     "SecondMode",
     "fit_at",
-    "fit_from_soil",
     "fit_window",
 ]
 
@@ -157,28 +156,6 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
         if not best.converged:
             return refit_denoised(objective, best)
         return _with_second_mode(objective, thin, best, ends)
-
-
-def fit_from_soil(
-    problem: ObservationModel, prior: SoilPrior, start: Soil, joint_prior: Gaussian | None = None
-) -> Fit | None:
-    """Posterior of a window from one start.
-
-    Far from the optimum only the soil moves, with the latents as measured: latents and gains would absorb
-    the residuals of a wrong soil.  Near it everything moves together.
-
-    Returns
-    -------
-    Fit or None
-        None where the numbers are not finite.
-    """
-    joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
-    soil, options = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median), problem.options.search
-    with np.errstate(all="ignore"):
-        as_measured = Objective(problem, prior, joint_prior, as_measured=True)
-        alone = replace(options.soil_alone, max_evaluations=options.cold.max_evaluations)
-        near = minimise(as_measured, as_measured.start(soil), alone)
-        return _cold_fit(Objective(problem, prior, joint_prior), near)
 
 
 class WarmStart(NamedTuple):
@@ -358,13 +335,6 @@ def _other_end(thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None
 
     away = max(thin.options.other_optimum_sd**2, min(map(squared_distance, ends)))
     return next((end for end in ends[1:] if squared_distance(end) > away), None)
-
-
-def _cold_fit(objective: Objective, near: Solution[Iterate, WindowModel]) -> Fit | None:
-    """The fit by a joint descent from where one with latents as measured ended; None where it is not finite."""
-    if near.model is None:
-        return None
-    return fit_at(objective, minimise(objective, near.previous, objective.options.cold), near.evaluations)
 
 
 def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluations: int = 0) -> Fit | None:

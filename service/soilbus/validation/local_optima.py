@@ -16,7 +16,7 @@ import numpy as np
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
+from soilbus.estimation.multistart import Fit, fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
@@ -25,7 +25,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation.windows import observed
+from soilbus.validation.windows import fit_from_soil, observed
 
 __all__ = [
     "EXCITED",

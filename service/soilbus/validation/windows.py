@@ -9,13 +9,18 @@ from numpy.typing import NDArray
 
 from soilbus.can.channels import Column
 from soilbus.config.model import Config
+from soilbus.diagnosis.joint_fit import Start, fit_jointly
 from soilbus.estimation.assembly import model_of, motors_of, rig_of
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import true_readings
+from soilbus.terra.wheel import Soil
 
 
 def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
@@ -69,3 +74,17 @@ def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np
         torque_limit=torque_limit,
         fresh=fresh,
     )
+
+
+def fit_from_soil(problem: ObservationModel, prior: SoilPrior, start: Soil) -> Fit | None:
+    """The fit of a window from one soil: first that alone with the latents as measured, then all together.
+
+    Returns
+    -------
+    Fit or None
+        None where the numbers are not finite.
+    """
+    gains, joint_prior = np.zeros(len(problem.gain_std)), Gaussian.of(prior, problem.gain_std)
+    begin = Start(np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median), gains)
+    fits = fit_jointly([problem], prior, [joint_prior], gains > 0.0, [begin], problem.options.search.cold)
+    return None if fits is None else fits[0]

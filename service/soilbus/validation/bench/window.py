@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
+from soilbus.estimation.multistart import Fit, fit_window
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.recording import simulate
@@ -26,7 +26,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 from soilbus.validation.bench.figure import Figure, in_turn
-from soilbus.validation.windows import observed
+from soilbus.validation.windows import fit_from_soil, observed
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 EXACT_AND_ROUGH = (("c", "K"), ("K", "c"))
