@@ -62,7 +62,7 @@ def test_every_instant_is_held_out_once(record):
 
 
 def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
-    """Tables, a model that did not converge, and a gap that a third of the blocks shows well enough."""
+    """Tables, and a model that did not converge; a gap that a third of the blocks shows is of all folds."""
     found = fit_model([record], PRIOR, ())
     alone = gap_of_fold(found)
     assert alone[:2] == pytest.approx((found.held_out_chi2, found.checked_rows))
@@ -70,7 +70,7 @@ def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
     creeping = replace(found, fits=tuple(replace(fit, termination=Termination.LIMIT) for fit in found.fits))
     assert gap_of([record], PRIOR, creeping) == alone
     clear = replace(found, checks=tuple(replace(check, chi2=3.0 * check.rows) for check in found.checks))
-    assert gap_of([record], PRIOR, clear) == gap_of_fold(clear)
+    assert gap_of([record], PRIOR, clear).rows > gap_of_fold(clear).rows
 
 
 @pytest.mark.parametrize("machine", ["tractor-axles", "tractor-2wd"])

@@ -118,12 +118,12 @@ def _excess_and_degrees(check: HeldOutCheck, gains: Array) -> tuple[float, float
 def gap_of(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> Gap:
     """The gap of a model that was fitted to these records, over all folds.
 
-    Over the one fold only where its gap exceeds `max_cross_validated`, where no other can be held out (tables), and
-    where the model or a further fit did not converge.
+    Over the one fold only where no other can be held out (tables), and where the model or a further fit did not
+    converge.
     """
     options, of_folds = records[0].options, _misfit(fitted)
     one_fold = of_folds.gap
-    if not fitted.converged or fitted.held_out_chi2 > options.max_cross_validated:
+    if not fitted.converged:
         return one_fold
     for fold in range(options.folds - 1):
         divided = [record.with_held_out(fold) for record in records]

@@ -91,7 +91,7 @@ class Record:
     def thinned(self, every: int) -> Record:
         """The same with each `every`-th instant; a table of few rows keeps all of them."""
         parts = self.training, self.held_out
-        least = self.options.min_instants
+        least = self.options.min_sample
         training, held_out = (part.part(slice(None, None, min(every, part.n // least + 1))) for part in parts)
         return replace(self, training=training, held_out=held_out, whole=None, fold=None)
 
@@ -129,7 +129,7 @@ def record_of(
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
-    if min(map(len, parts)) < options.min_instants:
+    if min(map(len, parts)) < options.min_sample:
         raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
     training, held_out = (problem.part(part) for part in parts)
     if not (training.n_rows and held_out.n_rows):

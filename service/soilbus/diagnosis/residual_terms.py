@@ -131,7 +131,7 @@ def _selected(sample: _Sample, options: DiagnosisOptions) -> list[Term]:
     """Terms by forward selection while BIC, with the choice among candidates counted, falls."""
     chosen: list[str] = []
     chi2, n = float(sample.z @ sample.z), len(sample.z)
-    while len(chosen) < options.max_effects and n > options.where_residuals:
+    while len(chosen) < options.max_effects and n > options.min_sample:
         trials = {name: _chi2_after(sample, [*chosen, name]) for name in sample.regressors if name not in chosen}
         best = min(trials, key=lambda name: trials[name])
         if chi2 - trials[best] < 2.0 * math.log(n) + 2.0 * math.log(len(trials)):

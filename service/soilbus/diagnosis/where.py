@@ -28,6 +28,8 @@ from soilbus.estimation.posterior import PARAMETERS
 
 _SOIL = len(PARAMETERS)
 _REGRESSORS = ("slip", "load", "speed", "time")
+ROUNDING = 1e-9
+"""Of a difference of two variances, over either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,7 @@ def disagreements(records: Sequence[Record], fitted: FittedModel) -> list[Disagr
         for record, check, fit in zip(records, fitted.checks, fitted.fits, strict=True)
         for test in _tests(record.name, check, fit.mode, options)
     ]
-    tests += [*_gain_tests(fitted, options), *_parameter_tests(fitted, options)]
+    tests += [*_gain_tests(fitted), *_parameter_tests(fitted)]
     tests.sort(key=lambda test: -abs(test[0]))
     found, worst = [], 0.0
     for rank, (deviations, place) in enumerate(tests):
@@ -96,13 +98,13 @@ def _tests(
             "time": problem.since,
         }
         known = np.isfinite(z[:, i])
-        for region, members in _regions(regressors, known, options.where_residuals):
+        for region, members in _regions(regressors, known, options.min_sample):
             n = len(members)
             mean, slope = z[members, i].mean(), slopes[members, i].mean(0)
             sd = math.sqrt(1.0 / n + float(slope @ gaussian.covariance @ slope))
             yield mean / sd, Disagreement(channel, wheel, region, float(raw[members, i].mean()), log)
         n = int(known.sum())
-        if n >= options.where_residuals:
+        if n >= options.min_sample:
             square = float((z[known, i] ** 2).mean())
             uncertain = gaussian.covariance @ (
                 slopes[known, i].T @ slopes[known, i]
@@ -132,19 +134,19 @@ def _regions(
                 yield f"{name} {low:.3g}..{high:.3g}", members
 
 
-def _gain_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tuple[float, Disagreement]]:
+def _gain_tests(fitted: FittedModel) -> Iterator[tuple[float, Disagreement]]:
     """Tests of the gain errors against their priors: a fit may hide an effect in them."""
     problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
     for i in range(problem.n_sensors):
         std = float(problem.gain_std[i])
         shift_variance = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # of the posterior mean, under noise
-        if std > 0.0 and shift_variance > options.min_variance_share * std**2:
+        if std > 0.0 and shift_variance > ROUNDING * std**2:
             quantity, _, wheel = problem.gain_names[i].partition(".")
             gain = float(gaussian.gains[i])
             yield gain / math.sqrt(shift_variance), Disagreement(quantity, wheel, "gain", gain)
 
 
-def _parameter_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator[tuple[float, Disagreement]]:
+def _parameter_tests(fitted: FittedModel) -> Iterator[tuple[float, Disagreement]]:
     """Tests of the effects' parameters that recordings share against their priors, as of the gain errors.
 
     A parameter at the edge of its range has no posterior variance: its shift has at most the prior's.
@@ -157,7 +159,7 @@ def _parameter_tests(fitted: FittedModel, options: DiagnosisOptions) -> Iterator
         u = float(gaussian.gains[i])
         shift = free.at(u) - prior.value
         shift_variance = 1.0 - float(gaussian.covariance[_SOIL + i, _SOIL + i]) if free.std > 0.0 else 1.0
-        if shift_variance > options.min_variance_share:
+        if shift_variance > ROUNDING:
             wheel = "" if prior.wheel is None else problem.rig.wheels[prior.wheel]
             place = Disagreement(prior.effect, wheel, f"parameter {prior.parameter.name}", shift)
             yield shift / prior.std / math.sqrt(shift_variance), place
