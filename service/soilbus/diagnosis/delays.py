@@ -55,7 +55,7 @@ class DelayPosterior(NamedTuple):
 def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float) -> FittedModel:
     """A fitted model that reports delays by their joint posteriors.
 
-    Fitted again from the best delays where these lower -2 log posterior, tempered, by more than a descent leaves open.
+    Fitted again from the best delays where these lower -2 log posterior, tempered, by more than `negligible_fall`.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
         The temperature.
     """
     found = delay_posteriors(records, prior, fitted, divisor)
-    if any(posterior.fall > records[0].options.compared.step_tolerance * divisor for posterior in found.values()):
+    if any(posterior.fall > records[0].options.negligible_fall * divisor for posterior in found.values()):
         better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
         if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
             fitted, found = better, delay_posteriors(records, prior, better, divisor)

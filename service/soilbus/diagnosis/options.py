@@ -36,8 +36,10 @@ class DiagnosisOptions:
     """The first fit of a candidate has one instant in this many.  With 8 no verdict of the golden diagnoses moves, with
     1 thrown soil is ambiguous in place of named."""
     compared: SolverOptions = field(default_factory=lambda: SolverOptions(step_tolerance=2e-2))
-    """Descent of fits that are compared: 0.02 of -2 log decides nothing.  With a margin of 4 between models that count
-    as equally good no value of the golden diagnoses moves."""
+    """Descent of fits that are compared by their objective: 0.02 of -2 log decides nothing."""
+    negligible_fall: float = 1.0
+    """Fall of -2 log posterior or evidence up to which two models are equally good: odds of e^0.5.  With 0 and 4 no
+    value of the golden diagnoses moves, but with 0 a fit that found nothing is not tried from elsewhere."""
     check_rounds: int = 3
     """Linearisations that bring the latents of held-out blocks to their optimum.  With 5 eleven values of the golden
     diagnoses move, with 1 nearly six hundred."""

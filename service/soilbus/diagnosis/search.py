@@ -104,7 +104,7 @@ class Search:
             if wider is None or self._falls_short(present, wider):
                 return
             found = self.with_swaps(wider)
-            if found.neg2_log_evidence > present.neg2_log_evidence - self.options.compared.step_tolerance:
+            if found.neg2_log_evidence > present.neg2_log_evidence - self.options.negligible_fall:
                 return
             present = found
             yield [self.addition(present, effect) for effect in self.added(present)], present
@@ -126,7 +126,7 @@ class Search:
                 if without is None:
                     continue
                 other = self.best(without)
-                enough = model.neg2_log_evidence - self.options.compared.step_tolerance
+                enough = model.neg2_log_evidence - self.options.negligible_fall
                 if other is not None and other.neg2_log_evidence < enough:
                     better = other
                 elif self._falls_short(without, model):
@@ -343,7 +343,7 @@ class FitCache:
     def _explains_nothing(self, fit: FittedModel | None, with_fewer: FittedModel | None) -> bool:
         """Whether a model fits no better than one with a subset of its effects: from another start it may."""
         return with_fewer is not None and (
-            fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - self.options.compared.step_tolerance
+            fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - self.options.negligible_fall
         )
 
 
