@@ -265,19 +265,19 @@ def _search(thin: Objective) -> list[_End]:
         end = _end_from(thin, np.asarray(start))
         if end is None:
             continue
-        met = any(abs(end.chi2 - other.chi2) < options.same_end * other.chi2 for other in ends)
+        met = any(abs(end.value - other.value) < options.same_end * other.value for other in ends)
         ends.append(end)
-        if met and end.chi2 < options.plausible_chi2:
+        if met and end.value < options.plausible_chi2 * thin.problem.n_rows:
             break
-    return sorted(ends, key=lambda end: end.chi2)
+    return sorted(ends, key=lambda end: end.value)
 
 
 class _End(NamedTuple):
-    """Where a descent on a few instants ended: soil (6,), gains (G,), objective per residual there, evaluations."""
+    """Where a descent on a few instants ended: soil (6,), gains (G,), objective there, and evaluations of the model."""
 
     soil: Array
     gains: Array
-    chi2: float
+    value: float
     evaluations: int
 
 
@@ -286,15 +286,14 @@ def _end_from(thin: Objective, soil: Array) -> _End | None:
     end = minimise(thin, thin.start(soil), thin.options.soil_alone)
     if end.model is None:
         return None
-    chi2 = end.model.neg2_log_posterior / max(thin.problem.n_rows, 1)
-    return _End(end.previous.soil, end.previous.gains, chi2, end.evaluations)
+    return _End(end.previous.soil, end.previous.gains, end.model.neg2_log_posterior, end.evaluations)
 
 
 def _joint_fit(objective: Objective, end: _End) -> Fit | None:
     """The fit to all instants from an end of the search; None where the numbers are not finite."""
     options, start = objective.options, objective.start(end.soil, gains=end.gains)
     descent = options.cold
-    if not end.chi2 < 2.0 * options.plausible_chi2:  # latents as measured leave more than fitted ones
+    if not end.value < options.implausible * options.thinned:
         descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
     return fit_at(objective, minimise(objective, start, descent), end.evaluations)
 

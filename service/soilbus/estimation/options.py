@@ -89,12 +89,13 @@ class SearchOptions:
     """Instants of a window that the search for starts uses.  With 12 and 48 no status of the golden replays moves."""
     plausible_chi2: float = 3.0
     """Objective per residual [1] up to which an optimum of the search may be the soil's.  With 1.5 no status of the
-    golden replays moves, with 6 a window across a border gets an estimate.  From twice as much with latents as measured
-    a window cannot be of one soil."""
+    golden replays moves, with 6 a window across a border gets an estimate."""
+    implausible: float = 60.0
+    """Objective per thinned instant [-2 log] above which a window cannot be of one soil.  Without this limit the
+    budget of a border's search is gone before another soil is found."""
     max_implausible_evaluations: int = 5
-    """Evaluations from an end whose objective is too high for one soil, so that the budget of a border's search is left
-    for another one: with 10 a window across the border of `replay-bogging` gets an estimate, with 1 no status moves,
-    but a fit with a parameter at its bound does not converge."""
+    """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
+    `replay-bogging` gets an estimate."""
     other_optimum_sd: float = 10.0
     """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
     are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""
