@@ -756,7 +756,11 @@ class ObservationModel(Measurements):
         """Derivatives (R, 4) of the residuals by `model_form.FORM` at an optimum, and these weighed by S^-1."""
         soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
         layout, (n, m) = self.layout, at.by_latents.shape[:2]
-        by_form = self._contact_by_form(soil, gains, latents)
+        instants = np.unique(
+            np.linspace(0, n - 1, math.ceil(n / self.options.posterior.form_stride)).round().astype(int)
+        )
+        sparse = self.part(instants)._contact_by_form(soil, gains, latents.part(instants))
+        by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
         rows = np.zeros((n, m, len(pull)))
@@ -1276,3 +1280,13 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array
         diagonal += SINGULAR_RIDGE
         inverse = np.linalg.inv(S)
     return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
+
+
+def _interpolated(instants: NDArray[np.intp], values: Array, n: int) -> Array:
+    """Linear interpolation (..., N, W) of values (..., S, W) at S of n instants, the first and the last among them."""
+    if len(instants) == n:
+        return values
+    at = np.arange(n)
+    after = np.minimum(np.searchsorted(instants, at, side="right"), len(instants) - 1)
+    share = ((at - instants[after - 1]) / (instants[after] - instants[after - 1]))[:, None]
+    return np.asarray((1.0 - share) * values[..., after - 1, :] + share * values[..., after, :])

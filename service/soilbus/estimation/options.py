@@ -160,6 +160,10 @@ class PosteriorOptions:
     golden replays moves."""
     knot_spacing: float = 1.0
     """Time [s] between two knots of the path's curvature.  With 0.5 and 2 s no status of the golden replays moves."""
+    form_stride: int = 4
+    """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
+    mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
+    one on a curve."""
 
 
 @dataclass(frozen=True, slots=True)
