@@ -346,7 +346,7 @@ LIES = {
     "torque zero": (MCU_RR, lambda data: b"\x00\x00" + data[2:], "implausible torque.RR"),
     "load doubled": (LOADS, scaled(slice(0, 2), 2.0, "big"), "implausible load.FL"),
     "wheel speed 30 % high": (SPEEDS, scaled(slice(4, 6), 1.3, "little"), "model_mismatch"),
-    "ground speed halved": (RADAR, scaled(slice(0, 2), 0.5, "little"), "model_mismatch"),
+    "ground speed halved": (RADAR, scaled(slice(0, 2), 0.5, "little"), "implausible ground_speed acceleration"),
     "draft zero": (DRAWBAR, lambda data: b"\x00\x00" + data[2:], "implausible draft"),
 }
 
