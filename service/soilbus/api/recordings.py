@@ -180,7 +180,7 @@ def diagnose(logs: PathLike | Sequence[PathLike], config: Config | PathLike) -> 
     >>> found.verdict, list(found.effects)
     ('named', ['slip_sinkage'])
     >>> found
-    an effect is missing, and the data tell which: slip_sinkage (gap 1.55 -> 1.02)
+    an effect is missing, and the data tell which: slip_sinkage (gap 1.47 -> 1.02)
     """
     path = None if isinstance(config, Config) else found_configuration(str(config))
     return Diagnosis(diagnose_logs(_config(config), _paths(logs)), path)
