@@ -1,0 +1,81 @@
+"""Mechanical front-wheel drive: an axle that its clutch has left behind pulls nothing, whatever the configuration says.
+
+The truth is the rear-driven tractor, whose front wheels roll freely; the configuration has a shaft to both axles.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+
+import numpy as np
+import pytest
+
+from soilbus.can.dbc_files import load_databases
+from soilbus.config.file import parse_config
+from soilbus.decision.capability import assess
+from soilbus.estimation.assembly import model_of, rig_of
+from soilbus.estimation.posterior import Posterior
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.intake import Intake
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import REFERENCES, reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.soils import soil_named
+from soilbus.validation.fakes import feed_message
+
+TRUTH = reference_configuration(path=REFERENCES["tractor-2wd"])
+
+
+def with_a_shaft_to_both_axles(lead: float = 1.0):
+    """The rear motor as that of both axles, geared so that they turn alike; lead: of the front wheels' rims."""
+    raw = tomllib.loads(REFERENCES["tractor-2wd"].read_text())
+    rear = raw["axle"][0]
+    radius = {wheel["axle"]: wheel["radius"] for wheel in raw["wheel"]}
+    load = {"name": "rear", "differential": "open", "load": rear.pop("load")}
+    front = {"name": "front", "differential": "open", "gear_ratio": radius["front"] / radius["rear"] / lead}
+    raw["axle"] = [rear | {"name": "both", "differential": "locked"}, load, front]
+    for wheel in raw["wheel"]:
+        wheel.pop("driven", None)
+    return parse_config(raw, REFERENCES["tractor-2wd"].parent)
+
+
+def largest_draft(truth, config, seed: int):
+    """Of the last window of a drive on loam."""
+    intake = Intake(config, load_databases(config))
+    for message in frames(simulate(truth, excited("loam", 12.5), seed), truth):
+        feed_message(intake.admission, message)
+    intake.ingest()
+    estimator = WindowEstimator(config)
+    return [estimator.solve(task) for task in intake.finish(message.timestamp)][-1].traversability.max_draft
+
+
+@cache
+def exact_drafts() -> tuple[float, float]:
+    """Largest draft [N] on loam with the rear wheels and with all wheels."""
+    soil = Posterior(soil_named("loam"), np.zeros((6, 6)))
+    limits = ((TRUTH, [0.0, 0.0, np.nan, np.nan]), (with_a_shaft_to_both_axles(), [np.nan] * 4))
+    rear, both = (
+        assess(soil, rig_of(config), model_of(config), None, np.array(limit), 0.6, 0.5)[0].max_draft.value
+        for config, limit in limits
+    )
+    return rear, both
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("lead", [1.0, 1.05])
+def test_a_front_axle_that_is_not_engaged_does_not_count_for_the_largest_draft(lead, seed):
+    rear, both = exact_drafts()
+    assert both > 1.5 * rear
+    found = largest_draft(TRUTH, with_a_shaft_to_both_axles(lead), seed)
+    assert abs(found.value - rear) < 3.0 * np.hypot(found.std, 0.05 * rear)
+    assert found.value + 3.0 * found.std < both
+
+
+@pytest.mark.parametrize("lead", [0.95, 1.0, 1.05])
+def test_an_engaged_front_axle_counts_also_where_its_gear_is_not_known_well(lead):
+    rear, both = exact_drafts()
+    found = largest_draft(with_a_shaft_to_both_axles(), with_a_shaft_to_both_axles(lead), 3)
+    assert abs(found.value - both) < 3.0 * found.std
+    assert found.value - 3.0 * found.std > rear
