@@ -593,3 +593,34 @@ def test_a_draft_that_is_known_to_be_none_is_no_frozen_sensor(tmp_path):
     recording = simulate(config, scenario, 5)
     found = beside(config, [frame_of(message) for message in frames(recording, config)])
     assert not [finding for finding in found.findings if "draft" in finding.text]
+
+
+def with_a_radar(least: float, scenario: Scenario) -> list[Frame]:
+    """A drive whose ground speed reads zero below a speed [m/s]."""
+    config = reference_configuration()
+    recording = simulate(config, scenario, 11)
+    ground = recording.channels["ground_speed"]
+    read = replace(ground, value=np.where(ground.value < least, 0.0, ground.value))
+    changed = replace(recording, channels=recording.channels | {"ground_speed": read})
+    return [frame_of(message) for message in frames(changed, config)]
+
+
+def with_min_speed(limit: float) -> Config:
+    config = reference_configuration()
+    return config.model_copy(update={"estimator": config.estimator.model_copy(update={"min_speed": limit})})
+
+
+def test_a_radar_that_measures_no_slow_speed_is_named_with_the_limit_that_mends_it():
+    creeping = replace(scenario_over(["loam"], 40.0), speed=Swing(0.2, 0.8))
+    config = reference_configuration()
+    named = [w for w in beside(config, with_a_radar(0.4, creeping)).warnings if "reads 0 for up to" in w]
+    assert len(named) == 1
+    assert named[0].startswith("signals.ground_speed: ")
+    limit = float(named[0].rpartition("estimator.min_speed = ")[2])
+    assert 0.4 <= limit <= 0.7
+    for heard, settings in (
+        (with_a_radar(0.0, creeping), config),
+        (with_a_radar(0.4, replace(creeping, speed=Swing(0.6, 1.5))), config),
+        (with_a_radar(0.4, creeping), with_min_speed(limit)),
+    ):
+        assert not [w for w in beside(settings, heard).warnings if "reads 0 for up to" in w]

@@ -241,7 +241,11 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
         *_of_several_senders(channels, admission.counts),
         *(f for s in seen for f in _of_one(s, database)),
     ]
-    findings += [*_stuck_and_jagged(seen, longest, config), *_mixed_rates(seen, config)]
+    findings += [
+        *_stuck_and_jagged(seen, longest, config),
+        *_too_slow_to_measure(longest, config),
+        *_mixed_rates(seen, config),
+    ]
     facts = _facts(with_motors, mapped, longest, database)
     open_questions = [f"{s.channel.key}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
     if facts is not None:
@@ -449,6 +453,28 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
                 True,
                 (name,),
             )
+
+
+def _too_slow_to_measure(heard: Columns, config: Config) -> Iterator[Finding]:
+    """A ground speed that reads zero while the wheels turn slowly, and has no value below some speed else."""
+    t, ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
+    speeds = [(*heard[f"speed.{w.name}"], w.radius) for w in config.wheel if f"speed.{w.name}" in heard]
+    moves = ground != 0.0
+    if not moves.any() or not speeds:
+        return
+    least, settings = float(np.abs(ground[moves]).min()), config.traversability
+    rim = np.mean([np.interp(t, at, radius * np.abs(speed)) for at, speed, radius in speeds], axis=0)
+    creeps = ~moves & (rim > settings.standstill) & (rim < least)
+    begins, ends = (np.flatnonzero(np.diff(np.pad(creeps.astype(int), 1)) == step) for step in (1, -1))
+    longest = max((float(t[end - 1] - t[begin]) for begin, end in zip(begins, ends, strict=True)), default=0.0)
+    if least > config.estimator.min_speed and longest > settings.stuck_time:
+        enough = math.ceil(20.0 * float(rim[~moves].max())) / 20.0
+        yield Finding(
+            f"signals.ground_speed: reads 0 for up to {longest:.1f} s while the wheels turn, and else never less than"
+            f" {least:.2g} m/s: a vehicle that creeps passes for one that is stuck; if the sensor measures no slower"
+            f" speed, set estimator.min_speed = {enough:.2f}",
+            False,
+        )
 
 
 def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
