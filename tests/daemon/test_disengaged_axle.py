@@ -6,6 +6,7 @@ The truth is the rear-driven tractor, whose front wheels roll freely; the config
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import parse_config
 from soilbus.decision.capability import assess
+from soilbus.decision.traction_loss import idle
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.posterior import Posterior
 from soilbus.pipeline.estimator import WindowEstimator
@@ -79,3 +81,17 @@ def test_an_engaged_front_axle_counts_also_where_its_gear_is_not_known_well(lead
     found = largest_draft(with_a_shaft_to_both_axles(), with_a_shaft_to_both_axles(lead), 3)
     assert abs(found.value - both) < 3.0 * found.std
     assert found.value - 3.0 * found.std > rear
+
+
+def test_a_front_axle_stays_disengaged_while_its_speeds_are_silent():
+    config = with_a_shaft_to_both_axles()
+    intake = Intake(config, load_databases(config))
+    for message in frames(simulate(TRUTH, excited("loam", 10.5), 3), TRUTH):
+        feed_message(intake.admission, message)
+    intake.ingest()
+    window, rig = intake.finish(message.timestamp)[0].window, intake.rig
+    apart = idle(window, rig, -np.inf, np.zeros(4, bool))
+    assert apart.tolist() == rig.front.tolist()
+    silent = replace(window, speed=np.where(rig.front, np.nan, window.speed))
+    for before in (apart, np.zeros(4, bool)):
+        assert idle(silent, rig, -np.inf, before).tolist() == before.tolist()

@@ -280,8 +280,8 @@ def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> N
     Behind a shaft that drives both axles no torque of one axle is measured: there speeds say whether it is engaged.
     """
     window = window.rows(np.flatnonzero(window.t > since))
-    shown, apart = _disengaged(window, rig)
-    return np.where(shown, apart, _without_torque(window, rig, before))
+    of_shaft, apart = _disengaged(window, rig, before)
+    return np.where(of_shaft, apart, _without_torque(window, rig, before))
 
 
 def _without_torque(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -296,32 +296,32 @@ def _without_torque(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDAr
     return np.where(2 * known.sum(axis=0) > len(known), 2 * still.sum(axis=0) > known.sum(axis=0), before)
 
 
-def _disengaged(window: Window, rig: Rig) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Wheels (W,) of which the speeds show whether a locked shaft drives them, and those that it does not.
+def _disengaged(window: Window, rig: Rig, before: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Wheels (W,) on a locked shaft to both axles, and which of them it does not turn; as before where it drives none.
 
     A shaft that drives turns both axles alike.  The axle that it does not turn is slower, and not faster than the
     ground, for it is pushed.
     """
-    shown, apart = np.zeros((2, len(rig.wheels)), bool)
+    of_shaft, apart = np.zeros(len(rig.wheels), bool), before.copy()
     given = rig.instrumentation
-    if given is None or not len(window.t):
-        return shown, apart
+    if given is None:
+        return of_shaft, apart
     turns = np.where(given.without_speed, np.nan, given.ratio * window.speed)
     rolls = rig.radius * window.speed - window.ground_speed[:, None]
     for coupling in given.couplings:
         wheels = [*coupling.one, *coupling.other]
         if coupling.of_axle or not coupling.locked or not any(set(wheels) <= set(m.wheels) for m in given.motors):
             continue
+        of_shaft[wheels] = True
         one, other = (turns[:, list(part)].mean(axis=1) for part in (coupling.one, coupling.other))
         drives = np.isfinite(one + other) & (window.torque[:, wheels].sum(axis=1) > 0.0)
         if 2 * drives.sum() <= len(drives):
             continue
-        shown[wheels] = True
         for part, own, others in ((coupling.one, one, other), (coupling.other, other, one)):
             pushed = rolls[:, list(part)].mean(axis=1) <= 0.0
             slower = own < (1.0 - CONSISTENCY.gear_slack) * others
             apart[list(part)] = 2 * (pushed & slower & drives).sum() > drives.sum()
-    return shown, apart
+    return of_shaft, apart
 
 
 def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], settings: Settings) -> Motion | None:
