@@ -19,7 +19,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
-from soilbus.estimation.parametrization import Coordinates, at_bounds
+from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Termination, minimise
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -132,17 +132,19 @@ def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_o
 
 
 def test_steps_end_at_the_bounds():
+    assert step_fraction_within(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
+    assert step_fraction_within(np.array([np.inf]), np.array([3.0])) == 1.0
     assert at_bounds(np.array([1.0, 2.0, 3.0]), np.ones(3), np.full(3, 3.0)).tolist() == [-1.0, 0.0, 1.0]
     prior = SoilPrior.from_value_std(dict(zip(PARAMETERS, [(v, 0.25 * v) for v in WET_CLAY], strict=True)))
     coordinates = Coordinates(prior, 0.3)
     soil = np.asarray(WET_CLAY, float)
     step = np.zeros(6)
     step[C] = 0.6
-    soil = coordinates.stepped(soil, step)
+    soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
     assert not len(coordinates.active_bounds(soil))
     assert soil[C] == pytest.approx(1.6 * WET_CLAY.c)  # c changes linearly, as the forces do
     for _ in range(2):
-        soil = coordinates.stepped(soil, step)
+        soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
     assert coordinates.active_bounds(soil).tolist() == [np.eye(6)[C].tolist()]
     assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND_SD * prior.log_std[C]))
 

@@ -137,10 +137,13 @@ class JointObjective:
         return JointModel(information, of_prior, curvature, gradient, value, np.vstack(bounds), tuple(models))
 
     def stepped(self, iterate: tuple[Iterate, ...], model: JointModel, step: Array) -> tuple[Iterate, ...]:
-        """The iterate of each recording after a step of all coordinates, shortened as that of any soil asks."""
-        each = list(zip(self.parts, self.columns, iterate, model.parts, strict=True))
-        fraction = min(part.step_fraction(step[columns]) for part, columns, *_ in each)
-        return tuple(part.stepped(at, of_part, fraction * step[columns]) for part, columns, at, of_part in each)
+        """The iterate of each recording after a step of all coordinates, shortened at the first bound of any."""
+        steps = [step[columns] for columns in self.columns]
+        fraction = min(map(Objective.step_fraction, self.parts, iterate, steps))
+        return tuple(
+            part.stepped(at, of_part, fraction * own)
+            for part, at, of_part, own in zip(self.parts, iterate, model.parts, steps, strict=True)
+        )
 
     def with_entry_angles(self, iterate: tuple[Iterate, ...]) -> tuple[Iterate, ...]:
         """The same iterates with their entry angles solved."""

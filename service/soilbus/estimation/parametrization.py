@@ -113,17 +113,13 @@ class Coordinates:
             curvature[i, i] = max(gradient[i], 0.0)
         return curvature
 
-    def step_fraction(self, step: Array) -> float:
-        """Fraction of a step (F,) of which no coordinate is longer than `max_log_step`, 1 at most."""
-        return min(1.0, self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12))
-
     def stepped(self, soil: Array, step: Array) -> Array:
-        """The soil (6,) after a step (F,), which is shortened to `max_log_step`, within the bounds.
+        """The soil (6,) after a step (F,), which is shortened to `max_log_step`.
 
         c and tan phi change linearly: along c + p tan phi, which a window at one pressure p measures alone, a step in
         logarithms would leave the valley.
         """
-        step = self.step_fraction(step) * step
+        step = step * min(1.0, self.options.max_log_step / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
         new = self.soil_at(self.position(soil) + step)
         if _C in self._column:
             new[_C] = soil[_C] * (1.0 + step[self._column[_C]])
@@ -133,6 +129,20 @@ class Coordinates:
             new[_PHI] = math.atan(tan + change)
         return self.within(new)
 
+    def step_fraction(self, soil: Array, step: Array) -> float:
+        """Fraction of a step (F,) from a soil (6,) within the bounds and `max_log_step`, 1 at most."""
+        low, high = self._log_bounds
+        change = self.log_directions(soil)[self.free] @ step
+        room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
+        if _C in self._column:  # changes linearly, see `stepped`
+            room[self._column[_C]] = np.expm1(room[self._column[_C]])
+        if _PHI in self._column:
+            column, tan = self._column[_PHI], math.tan(soil[_PHI])
+            bound = math.tan(soil[_PHI] * math.exp(room[column]))
+            room[column] = (bound - tan) / (soil[_PHI] * (1.0 + tan**2))
+        longest = self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12)
+        return min(longest, step_fraction_within(room, change))
+
     def within(self, soil: Array) -> Array:
         """The soil (6,) with its free parameters clipped to the bounds, in place."""
         low, high = self._bounds
@@ -141,8 +151,7 @@ class Coordinates:
 
     def active_bounds(self, soil: Array) -> Array:
         """Outward directions (E, F) of the bounds that a soil (6,) is at."""
-        low, high = self._bounds
-        sides = at_bounds(np.log(soil[self.free]), np.log(low), np.log(high))
+        sides = at_bounds(np.log(soil[self.free]), *self._log_bounds)
         if not sides.any():
             return np.zeros((0, len(sides)))
         return np.asarray((sides[:, None] * self.log_directions(soil)[self.free])[sides != 0.0])
@@ -153,6 +162,11 @@ class Coordinates:
         centre, factor = self.prior.median[self.free], np.exp(self.options.bound_sd * self.prior.log_std[self.free])
         most = np.where(self.free == _PHI, MAX_PHI, np.inf)
         return centre / factor, np.minimum(centre * factor, most)
+
+    @cached_property
+    def _log_bounds(self) -> tuple[Array, Array]:
+        low, high = self._bounds
+        return np.log(low), np.log(high)
 
     @cached_property
     def _last_directions(self) -> list[Array]:
@@ -173,3 +187,11 @@ class Coordinates:
 def at_bounds(value: Array, low: Array, high: Array) -> Array:
     """1.0 or -1.0 (M,) where a value (M,) is at its upper or lower bound (M,), else 0.0."""
     return np.subtract(value >= high - BOUND_TOLERANCE, value <= low + BOUND_TOLERANCE, dtype=float)
+
+
+def step_fraction_within(room: Array, step: Array) -> float:
+    """Fraction of a step (M,), 1 at most, that stays within the signed distances (M,) to the bounds; inf: no bound."""
+    crosses = np.abs(step) > np.abs(room) + BOUND_TOLERANCE
+    if not crosses.any():
+        return 1.0
+    return max(float((room[crosses] / step[crosses]).min(initial=1.0)), 0.0)

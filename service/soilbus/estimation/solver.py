@@ -32,7 +32,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
 from soilbus.estimation.observation_model import FIRST_GAIN, SOIL, Latents, Linearisation, ObservationModel, Optimum
 from soilbus.estimation.options import SolverOptions
-from soilbus.estimation.parametrization import Coordinates, at_bounds
+from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
 
@@ -225,9 +225,9 @@ class Objective:
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
-        """The iterate after a step (F + A,), shortened and within the bounds, with latents as in `moved`."""
+        """The iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
         free = len(self.free)
-        step = self.step_fraction(step) * step
+        step = self.step_fraction(iterate, step) * step
         soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), iterate.gains.copy()
         gains[self.active] += step[free:]
         if self._has_gain_bounds:
@@ -255,9 +255,15 @@ class Objective:
         latents = self.problem.with_entry_angles(iterate.latents, iterate.as_soil(), iterate.gains)
         return replace(iterate, latents=latents)
 
-    def step_fraction(self, step: Array) -> float:
-        """Largest fraction of a step (F + A,), 1 at most, that changes no coordinate of the soil by too much."""
-        return self.coordinates.step_fraction(step[: len(self.free)])
+    def step_fraction(self, iterate: Iterate, step: Array) -> float:
+        """Largest fraction of a step (F + A,), 1 at most, within the bounds and step limits."""
+        free = len(self.free)
+        of_soil = self.coordinates.step_fraction(iterate.soil, step[:free])
+        if not self._has_gain_bounds:
+            return of_soil
+        low, high = self._gain_bounds
+        room = np.where(step[free:] > 0.0, high, low) - iterate.gains[self.active]
+        return min(of_soil, step_fraction_within(room, step[free:]))
 
     def _active_bounds(self, iterate: Iterate) -> Array:
         """Outward directions (E, F + A) of the bounds that an iterate is at."""
