@@ -27,9 +27,8 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.posterior import PARAMETERS
 
 _SOIL = len(PARAMETERS)
+_ROUNDING = float(np.sqrt(np.finfo(float).eps))  # of a difference of two variances, over either
 _REGRESSORS = ("slip", "load", "speed", "time")
-ROUNDING = 1e-9
-"""Of a difference of two variances, over either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +139,7 @@ def _gain_tests(fitted: FittedModel) -> Iterator[tuple[float, Disagreement]]:
     for i in range(problem.n_sensors):
         std = float(problem.gain_std[i])
         shift_variance = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # of the posterior mean, under noise
-        if std > 0.0 and shift_variance > ROUNDING * std**2:
+        if std > 0.0 and shift_variance > _ROUNDING * std**2:
             quantity, _, wheel = problem.gain_names[i].partition(".")
             gain = float(gaussian.gains[i])
             yield gain / math.sqrt(shift_variance), Disagreement(quantity, wheel, "gain", gain)
@@ -159,7 +158,7 @@ def _parameter_tests(fitted: FittedModel) -> Iterator[tuple[float, Disagreement]
         u = float(gaussian.gains[i])
         shift = free.at(u) - prior.value
         shift_variance = 1.0 - float(gaussian.covariance[_SOIL + i, _SOIL + i]) if free.std > 0.0 else 1.0
-        if shift_variance > ROUNDING:
+        if shift_variance > _ROUNDING:
             wheel = "" if prior.wheel is None else problem.rig.wheels[prior.wheel]
             place = Disagreement(prior.effect, wheel, f"parameter {prior.parameter.name}", shift)
             yield shift / prior.std / math.sqrt(shift_variance), place
