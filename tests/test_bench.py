@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-import soilbus.validation.bench as bench
+import soilbus.trials.bench as bench
 from soilbus.cli.main import main
-from soilbus.validation.bench import growth, paper, service, window
-from soilbus.validation.bench.figure import Figure, in_turn
+from soilbus.trials.bench import growth, paper, service, window
+from soilbus.trials.bench.figure import Figure, in_turn
 
 TARGETS = {
     "decode_speedup": ">= 20",

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.validation.bench.bus_ear import latencies, until_middle
-from soilbus.validation.bench.bus_load import Traffic
+from soilbus.trials.bench.bus_ear import latencies, until_middle
+from soilbus.trials.bench.bus_load import Traffic
 
 
 def test_latency_is_from_the_last_mapped_frame_of_the_window():

@@ -25,9 +25,9 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation.random_soils import assessed as assessed_within
-from soilbus.validation.random_soils import by_draws, figures
-from soilbus.validation.statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
+from tests.lab.random_soils import assessed as assessed_within
+from tests.lab.random_soils import by_draws, figures
+from tests.lab.statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)

@@ -22,8 +22,8 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import REFERENCES, reference_configuration
-from soilbus.validation import boggings, firm_drives
-from soilbus.validation.bogging_trials import (
+from soilbus.trials import boggings, firm_drives
+from soilbus.trials.bogging_trials import (
     Observation,
     Task,
     WarningTrial,

@@ -9,9 +9,9 @@ from contextlib import redirect_stdout
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.validation import paper_report
-from soilbus.validation.paper import EXACT, SIMPSON, WheelEquations
-from soilbus.validation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
+from soilbus.trials import paper_report
+from soilbus.trials.paper import EXACT, SIMPSON, WheelEquations
+from soilbus.trials.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
 
 
 @pytest.fixture(scope="module")

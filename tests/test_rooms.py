@@ -64,8 +64,8 @@ def test_the_arrows_make_no_circle() -> None:
         left = {room: lower for room, lower in left.items() if room not in lowest}
 
 
-def test_the_daemon_knows_neither_simulator_nor_validation() -> None:
-    assert below("daemon").isdisjoint({"simulator", "validation", "report", "diagnosis"})
+def test_the_daemon_knows_neither_simulator_nor_trials() -> None:
+    assert below("daemon").isdisjoint({"simulator", "trials", "report", "diagnosis"})
     assert "can" not in below("estimation") | below("diagnosis")
     assert below("terra") == below("config") == set()
 

@@ -22,7 +22,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.fleet import Fault, fleet, is_true, names_given, rivalry
+from tests.lab.fleet import Fault, fleet, is_true, names_given, rivalry
 
 GAIN = CATALOGUE["draft_gain"]
 

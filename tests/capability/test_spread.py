@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from soilbus.validation.capability_spread import Case, posterior_of, quantities
+from tests.lab.capability_spread import Case, posterior_of, quantities
 
 SEED, DRAWS = 6, 4000
 CASES = (

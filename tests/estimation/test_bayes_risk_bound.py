@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
-from soilbus.validation.bayes_risk_bound import bayes_risk
+from tests.lab.bayes_risk_bound import bayes_risk
 
 WEIGHT_POWERS = (-1.0, 0.0, 1.0, 2.0)
 """Powers of the weights that a bound is the greatest of."""

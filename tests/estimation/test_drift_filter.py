@@ -20,8 +20,8 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation import local_optima
-from soilbus.validation.driven_windows import errors, task_of, tracker_of, windows
+from tests.lab import local_optima
+from tests.lab.driven_windows import errors, task_of, tracker_of, windows
 
 PIECES = 5
 """Pieces of constant soil in a window, as the drift filter has them."""

@@ -16,9 +16,9 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation import local_optima
-from soilbus.validation.driven_windows import tasks
-from soilbus.validation.monte_carlo import prior_about
+from soilbus.trials.draws import prior_about
+from tests.lab import local_optima
+from tests.lab.driven_windows import tasks
 
 STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
 SLIPS = (0.05, 0.1, 0.2, 0.35)

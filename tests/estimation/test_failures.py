@@ -21,8 +21,8 @@ from soilbus.report.windows import summary
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
-from soilbus.validation import local_optima
-from soilbus.validation.driven_windows import tasks
+from tests.lab import local_optima
+from tests.lab.driven_windows import tasks
 
 CONFIG = reference_configuration()
 BAD = 10

@@ -14,9 +14,9 @@ from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.wheel import Soil
-from soilbus.validation import local_optima
-from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.importance_sampling import sample_posterior
+from tests.lab import local_optima
+from tests.lab.cramer_rao import cramer_rao
+from tests.lab.importance_sampling import sample_posterior
 
 STILL = Swing(0.0, 1e-9)
 

@@ -14,8 +14,8 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
-from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE
+from tests.lab.cramer_rao import cramer_rao
+from tests.lab.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE
 
 DURATION = 10.0
 

@@ -20,8 +20,8 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation import local_optima
-from soilbus.validation.windows import fit_from_soil
+from soilbus.trials.windows import fit_from_soil
+from tests.lab import local_optima
 
 BOUND_SD = 4.0
 """Prior standard deviations to which a free parameter is confined."""

@@ -14,8 +14,8 @@ from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation import computed_loads, local_optima
-from soilbus.validation.cramer_rao import cramer_rao
+from tests.lab import computed_loads, local_optima
+from tests.lab.cramer_rao import cramer_rao
 
 
 def test_noise_is_shrunk_to_the_mean_and_a_signal_stays():

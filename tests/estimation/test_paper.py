@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.optimize import fsolve
 
 from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
-from soilbus.validation.paper import (
+from soilbus.trials.paper import (
     AS_PRINTED,
     EXACT,
     EXACT_EXPONENTIAL,
@@ -23,7 +23,7 @@ from soilbus.validation.paper import (
     entry_angle,
     moduli_from_two_widths,
 )
-from soilbus.validation.paper_noise import (
+from soilbus.trials.paper_noise import (
     LEVELS,
     Noise,
     best_depth,
@@ -33,7 +33,7 @@ from soilbus.validation.paper_noise import (
     relative_errors,
     windows_of,
 )
-from soilbus.validation.paper_tables import (
+from soilbus.trials.paper_tables import (
     RUNS,
     SANDY_LOAM,
     START_ERRORS,

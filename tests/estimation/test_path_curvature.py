@@ -14,8 +14,8 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation.curved_drives import TRACK, curved, driven
-from soilbus.validation.driven_windows import errors, tracker_of, windows
+from tests.lab.curved_drives import TRACK, curved, driven
+from tests.lab.driven_windows import errors, tracker_of, windows
 
 
 @pytest.mark.parametrize("radius", [75.0, 25.0, -40.0])

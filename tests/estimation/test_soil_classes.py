@@ -15,7 +15,7 @@ from soilbus.estimation.soil_classes import WITHIN_CLASS_SD, SoilClasses, guesse
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil
-from soilbus.validation.class_reliability import WIDE_COHESION, Prediction, driven, shortfall, windows
+from tests.lab.class_reliability import WIDE_COHESION, Prediction, driven, shortfall, windows
 
 PRIOR_UNKNOWN = 0.5
 """Prior probability that a soil is none of the table."""
@@ -112,7 +112,7 @@ def test_probabilities_are_calibrated_on_gaussians():
 
 
 def test_probabilities_are_calibrated_on_simulated_windows():
-    """A small version of soilbus.validation.class_reliability."""
+    """A small version of tests.lab.class_reliability."""
     found = list(windows(18, seed=2, seconds=10.0, slip=0.15))
     assert len(found) >= 10
     assert abs(shortfall(found)) < 3.0

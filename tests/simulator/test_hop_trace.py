@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 
 import soilbus
-from soilbus.validation.hop_trace import hop_trace
+from tests.lab.hop_trace import hop_trace
 
+REPO = Path(__file__).resolve().parents[2]
 COUNTS = r"(\d+) files, (\d+) functions, (\d+) calls of soilbus\n"
 LINES = re.compile(f"one hop enters {COUNTS}with its watch it enters {COUNTS}")
 
@@ -20,9 +21,9 @@ def test_a_hop_enters_the_same_code_in_two_runs():
 
 
 def test_another_process_prints_the_same_counts():
-    program = [sys.executable, "-m", "soilbus.validation.hop_trace"]
+    program = [sys.executable, "-m", "tests.lab.hop_trace"]
     env = {**os.environ, "PYTHONPATH": str(Path(soilbus.__file__).parents[1])}
-    text = subprocess.run(program, check=True, capture_output=True, text=True, env=env).stdout
+    text = subprocess.run(program, check=True, capture_output=True, text=True, env=env, cwd=REPO).stdout
     found = LINES.fullmatch(text)
     assert found is not None
     assert tuple(map(int, found.groups())) == (*hop_trace(), *hop_trace(watched=True))

@@ -9,16 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import soilbus.validation.monte_carlo as of_room
-from soilbus.cli.main import main
+import tests.lab.monte_carlo as of_room
 from soilbus.config.file import load_config, machine
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
-from soilbus.validation.bayes_risk_bound import BayesRisk
-from soilbus.validation.monte_carlo import (
+from soilbus.trials import draws
+from tests.lab.bayes_risk_bound import BayesRisk
+from tests.lab.monte_carlo import (
     ROUGHLY_KNOWN,
     Trial,
     as_json,
@@ -28,7 +28,7 @@ from soilbus.validation.monte_carlo import (
     tasks_of,
     trials,
 )
-from soilbus.validation.monte_carlo_report import monte_carlo_report
+from tests.lab.monte_carlo_report import main, monte_carlo_report
 
 CONFIG = reference_configuration(ROUGHLY_KNOWN)
 
@@ -78,7 +78,7 @@ def test_soils_around_a_named_one_are_drawn_until_the_tractor_gets_on(monkeypatc
         return SimpleNamespace(bogged_at=1.0 if len(driven) % 2 else None)
 
     driven = []
-    monkeypatch.setattr(of_room, "simulate", stuck_at_first)
+    monkeypatch.setattr(draws, "simulate", stuck_at_first)
     held = reference_configuration([*ROUGHLY_KNOWN, "soil.K.std=0"])
     found = [of_room.driven(task)[1] for task in tasks_of(held, "wet_clay", 2.0, 200, 5, around=0.2)]
     assert found == driven[1::2]
@@ -185,7 +185,7 @@ def test_where_the_tractor_cannot_drive():
 
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "out.json"
-    assert main(["montecarlo", "--windows", "1", "--seed", "4", "--set", "soil.k_c.std=0", "--json", str(out)]) == 0
+    assert main(["--windows", "1", "--seed", "4", "--set", "soil.k_c.std=0", "--json", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     cells = json.loads(out.read_text())
     assert len(cells) == 18
@@ -200,20 +200,6 @@ def test_the_command(tmp_path, capsys):
     for soil in ("loam", "wet_clay", "dry_sand"):
         assert bound[soil, 60.0, True] < bound[soil, 10.0, True] < bound[soil, 2.0, True]
         assert all(bound[soil, d, True] < bound[soil, d, False] for d in (2.0, 10.0, 60.0))
-
-
-@pytest.mark.parametrize("wrong", [["--windows", "0"], ["--windows", "x"], ["--seed", "-1"]])
-def test_wrong_usage_of_the_command(wrong, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["montecarlo", *wrong])
-    assert stop.value.code == 2
-
-
-def test_a_configuration_without_a_vehicle_is_one_line(tmp_path, capsys):
-    empty = tmp_path / "empty.toml"
-    empty.write_text("")
-    assert main(["montecarlo", "--config", str(empty), "--windows", "1"]) == 1
-    assert capsys.readouterr().err.splitlines() == ["soilbus: the simulator needs a [vehicle] with [[wheel]]s"]
 
 
 @pytest.mark.parametrize("name", ["tractor-2wd", "tractor-axles"])

@@ -1,0 +1,230 @@
+"""Trials of the largest draft: predicted from one window, beside the true one, on simulated drives.
+
+    relative error = predicted / true - 1,    covered if |predicted - true| < 1.96 std
+
+Each drive has a soil of its own near a named one, works at moderate slips, and is estimated from one window without
+any earlier one. The true largest draft is solved by the simulator's equilibrium at 50 slips.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.config.model import Config
+from soilbus.decision.capability import assess
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.laplace import cold_fit
+from soilbus.estimation.posterior import NORMAL_95
+from soilbus.estimation.window import Rig, pairs
+from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
+from soilbus.simulator.equilibrium import Mechanics, Situation, solve
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import soil_named
+from soilbus.terra.vehicle import axle_loads
+from soilbus.terra.wheel import Soil, WheelModel, sinkage
+from soilbus.trials.draws import Each, first_drive, prior_about
+from soilbus.trials.windows import observed, torque_limits
+
+__all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
+
+SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
+SOIL_LOG_SD = 0.1
+"""Standard deviation of the logarithms of a drive's soil parameters about the named soil."""
+LOW_SLIP, HIGH_SLIP = (0.04, 0.10), (0.20, 0.40)
+"""Ranges of the lowest and of the highest slip of a drive."""
+SLIP_SHARES = np.linspace(0.02, 1.0, 50)
+"""Slips at which the true draft is solved, over the greatest slip allowed."""
+
+
+class Task(NamedTuple):
+    """One drive."""
+
+    config: Config
+    soil: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class DraftTrial:
+    """Largest draft on the level [N]: predicted with its std, and true; nan where the fit failed."""
+
+    soil: str
+    predicted: float
+    std: float
+    true: float
+
+
+@dataclass(frozen=True, slots=True)
+class DraftFigures:
+    """All drives on one soil: median of |relative error|, median error, share of 95 % intervals that hold the truth."""
+
+    soil: str
+    drives: int
+    failed: int
+    error: float
+    bias: float
+    coverage: float
+    true: float
+
+
+def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> Iterator[DraftFigures]:
+    """Figures of each of SOILS, then of all.
+
+    Parameters
+    ----------
+    config
+        The vehicle.
+    drives
+        Number on each soil.
+    seed
+        The same seed gives the same drives.
+    each
+        The built-in map, or that of draws.processes.
+
+    Raises
+    ------
+    SimulationError
+        The tractor cannot drive on one.
+    """
+    everything: list[DraftTrial] = []
+    for name in SOILS:
+        key = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
+        tasks = [Task(config, name, int(s)) for s in key.generate_state(drives)]
+        everything += (of_soil := list(each(trial, tasks)))
+        yield figures(name, of_soil)
+    yield figures("all", everything)
+
+
+def trial(task: Task) -> DraftTrial:
+    """Simulate one drive, estimate, predict, and solve for the true draft."""
+    config, name, seed = task
+    soil, recording = _driven(task)
+    rig, model, settings = rig_of(config), model_of(config), config.traversability
+    prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
+    fit = cold_fit(observed(config, recording.channels, config.estimator.window), prior)
+    limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
+    truth = true_largest_draft(
+        soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law), np.inf, drivetrain_of(config)
+    )
+    if fit is None or not fit.converged:
+        return DraftTrial(name, np.nan, np.nan, truth)
+    able, _ = assess(
+        fit.reported.posterior, rig, model, None, torque_limits(config, rig), settings.max_slip, settings.max_sinkage
+    )
+    if able is None:
+        return DraftTrial(name, np.nan, np.nan, truth)
+    return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
+
+
+def _driven(task: Task) -> tuple[Soil, Recording]:
+    """The first soil drawn about the named one on which the vehicle gets on, and the drive over it."""
+    config, name, seed = task
+    rng = np.random.default_rng([seed, 2])
+
+    def draw() -> tuple[Soil, Scenario]:
+        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
+        slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+        return soil, Scenario(config.estimator.window, (Patch(0.0, name, soil),), slip=slip)
+
+    return first_drive(config, draw, seed)
+
+
+def true_largest_draft(
+    soil: Soil,
+    rig: Rig,
+    torque_limit: Array,
+    max_slip: float,
+    model: WheelModel,
+    max_sinkage: float = np.inf,
+    drivetrain: Drivetrain | None = None,
+    side_shift: float = 0.0,
+) -> float:
+    """Largest draft [N] held steadily on level ground; nan where there is none.
+
+    Parameters
+    ----------
+    soil, rig
+        Ground and vehicle.
+    torque_limit
+        Of the wheels (W,) [N m]; nan for none.
+    max_slip
+        Greatest slip.
+    model
+        Wheel-soil model.
+    max_sinkage
+        Greatest sinkage of a wheel [m].
+    drivetrain
+        What turns the wheels, with the limits of axles; by default a motor for each wheel.
+    side_shift
+        Share of each axle's load that a side slope moves to its left wheel.
+
+    Raises
+    ------
+    ValueError
+        The rig has no chassis.
+    """
+    if rig.chassis is None:
+        raise ValueError("a draft needs the vehicle's mass and geometry")
+    slips = max_slip * SLIP_SHARES
+    shape = (len(rig.radius), len(slips))
+    share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
+    left, right = pairs(rig)
+    share[left], share[right] = share[left] * (1.0 + side_shift), share[right] * (1.0 - side_shift)
+    free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))
+    none = np.zeros(len(slips))
+    limit = np.where(np.isfinite(torque_limit), torque_limit, np.inf)
+    drivetrain = own_motors(limit) if drivetrain is None else drivetrain
+    limits = np.concatenate([limit, drivetrain.limit[len(limit) :]])
+
+    def each_wheel(values: Any) -> Array:
+        return np.broadcast_to(np.asarray(values, float)[:, None], shape)
+
+    found = solve(
+        Situation(
+            t=none,
+            distance=none,
+            ground_speed=none + 1.0,
+            acceleration=none,
+            resistance=none,
+            level_load=each_wheel(free),
+            load_per_draft=each_wheel(drawn - free),
+            upright_load=np.zeros(shape),
+            deviation=np.zeros(shape),
+            radius=each_wheel(rig.radius),
+            width=each_wheel(rig.width),
+            length=each_wheel(np.zeros(len(rig.wheels)) if rig.lengths is None else rig.lengths),
+            soil=np.broadcast_to(np.asarray(soil)[:, None, None], (6, *shape)),
+            demand=none + np.inf,
+            slip_limit=slips,
+            torque_limit=np.broadcast_to(limits[:, None], (len(limits), len(slips))),
+            least_draft=none - np.inf,
+        ),
+        Mechanics(model, ~rig.front, rig.chassis.mass, 0.0, 0.0, drivetrain),
+    )
+    usable = found.found & (sinkage(found.entry_angle, rig.radius[:, None]) <= max_sinkage).all(axis=0)
+    return float(found.draft[usable].max()) if usable.any() else float("nan")
+
+
+def figures(soil: str, trials: Sequence[DraftTrial]) -> DraftFigures:
+    """The figures of some trials; nan where all failed."""
+    good = [t for t in trials if np.isfinite(t.predicted)]
+    predicted, std, true = (np.array([getattr(t, of) for t in good]) for of in ("predicted", "std", "true"))
+    if not good:
+        return DraftFigures(soil, len(trials), len(trials), *[float("nan")] * 4)
+    error = predicted / true - 1.0
+    return DraftFigures(
+        soil=soil,
+        drives=len(trials),
+        failed=len(trials) - len(good),
+        error=float(np.median(np.abs(error))),
+        bias=float(np.median(error)),
+        coverage=float(np.mean(np.abs(predicted - true) < NORMAL_95 * std)),
+        true=float(np.median(true)),
+    )

@@ -1,0 +1,80 @@
+"""Simulated drives as the daemon's estimator and the tracker see them, window by window."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.posterior import Posterior
+from soilbus.estimation.tracker import Settings, Tracker
+from soilbus.estimation.window import Window
+from soilbus.pipeline.intake import WindowTask
+from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.scenario import Scenario
+from soilbus.terra.wheel import Soil
+from soilbus.trials import windows as service_windows
+
+__all__ = [
+    "B_REF",
+    "Z_REF",
+    "errors",
+    "sweep",
+    "task_of",
+    "tasks",
+    "tracker_of",
+    "windows",
+]
+
+Z_REF, B_REF = 0.02, 0.3
+
+
+def tracker_of(config: Config) -> Tracker:
+    """A tracker as the service makes it."""
+    s = config.estimator
+    return Tracker(
+        rig_of(config), prior_of(config), model_of(config),
+        Settings(s.window, s.min_speed, s.max_turn, s.max_chi2, s.soil_drift, hop=s.hop),
+    )  # fmt: skip
+
+
+def windows(config: Config, recording: Recording) -> Iterator[tuple[Window, float]]:
+    """Each window of a recording with its end [s]."""
+    store, length = service_windows.bins_of(config, recording.channels), config.estimator.window
+    for end in np.arange(length, recording.truth["t"][-1] + 0.05, config.estimator.hop).tolist():
+        yield store.window(end - length, end), end
+
+
+def errors(posterior: Posterior, soil: Soil) -> np.ndarray:
+    """Errors (2,) of bearing pressure and tan phi, in their standard deviations."""
+    estimates = posterior.bearing_pressure(Z_REF, B_REF), posterior.tan_phi()
+    truth = soil.bearing_pressure(Z_REF, B_REF), np.tan(soil.phi)
+    return np.array([(estimate.value - value) / estimate.std for estimate, value in zip(estimates, truth, strict=True)])
+
+
+def task_of(window: Window, end: float, config: Config, index: int = 0) -> WindowTask:
+    """What the intake says of a window of which nothing is missing; the first has index 0."""
+    no_limit = np.full(len(config.wheel), np.nan)
+    return replace(service_windows.task_of(window, end, config, no_limit, fresh=index == 0), index=index)
+
+
+def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") -> Iterator[WindowTask]:
+    """The windows of a drive, hop by hop, but for the channels of one quantity."""
+    channels = simulate(config, scenario, seed).channels
+    wanted = {name: c for name, c in channels.items() if name.partition(".")[0] != without}
+    store, length = service_windows.bins_of(config, wanted), config.estimator.window
+    for i, end in enumerate(np.arange(length, scenario.duration + 0.05, config.estimator.hop).tolist()):
+        yield task_of(store.window(end - length, end), end, config, i)
+
+
+def sweep(text: str, seeds: int) -> argparse.ArgumentParser:
+    """Arguments of a sweep over drives: which seeds, and whether every window is printed."""
+    parser = argparse.ArgumentParser(description=text)
+    parser.add_argument("--seeds", type=int, default=seeds)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--windows", action="store_true")
+    return parser
