@@ -1,4 +1,4 @@
-"""The bound against brute force, and the estimator against the bound: `soilbus montecarlo` in small."""
+"""The bound against brute force, and the estimator against the bound: tests.lab.monte_carlo in small."""
 
 from __future__ import annotations
 

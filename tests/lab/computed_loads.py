@@ -19,7 +19,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Axle, Config, Signal
-from soilbus.estimation.assembly import DIFFERENTIAL_BIAS, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
@@ -42,6 +42,8 @@ FIELD_BOUNCE = 0.12
 BOUNCES = (0.03, FIELD_BOUNCE)
 """The same of a smooth field, and of one like the field vehicle's."""
 QUANTITIES = ("pressure", "tan phi", "n")
+OPEN_BIAS = 0.05
+"""Share of an axle's torque by which the two sides of an open differential differ through friction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ def window_of(task: Task) -> tuple[ObservationModel, SoilPrior] | None:
 def with_drawn_friction(config: Config, seed: int) -> Config:
     """The machine with a friction of its open differentials that is drawn: the estimator knows its sd alone."""
     rng = np.random.default_rng([seed, 2])
-    drawn = [DIFFERENTIAL_BIAS["open"] * abs(rng.standard_normal()) for _ in config.axle]
+    drawn = [OPEN_BIAS * abs(rng.standard_normal()) for _ in config.axle]
     return config.model_copy(update={
         "axle": [
             axle.model_copy(update={"torque_bias": bias} if axle.torque and axle.differential == "open" else {})

@@ -6,8 +6,7 @@ Measured are the samples (truth times one plus a gain error, plus noise); each g
 zero with its sd, each free soil parameter as one measurement by its prior. Unknown are the logarithms of the free
 parameters, the gains, and at each instant the loads and speeds, which are eliminated. No unbiased estimator has a
 smaller covariance (Kay, Fundamentals of Statistical Signal Processing, vol. I, 1993, sect. 3.7). A biased one may; and
-where a window leaves soils far from the true one possible, no estimator may reach the bound
-(tests/lab/bayes_risk_bound.py).
+where a window leaves soils far from the true one possible, no estimator may reach the bound.
 """
 
 from __future__ import annotations

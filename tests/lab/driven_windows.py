@@ -10,27 +10,65 @@ import numpy as np
 
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import Settings, Tracker
 from soilbus.estimation.window import Window
 from soilbus.pipeline.intake import WindowTask
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.scenario import Scenario
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.trials import windows as service_windows
 
 __all__ = [
     "B_REF",
+    "EXCITED",
+    "NAMES",
     "Z_REF",
+    "c_and_K_known",
+    "constant",
     "errors",
+    "observed_window",
     "sweep",
     "task_of",
     "tasks",
     "tracker_of",
+    "two_wheels",
     "windows",
 ]
 
 Z_REF, B_REF = 0.02, 0.3
+NAMES = ("loam", "wet_clay", "dry_sand")
+EXCITED, LEANING = Swing(0.05, 0.40), Swing(-0.15, 0.15)
+"""Slip of a drive, and the share of an axle's load that it shifts from side to side."""
+
+
+def constant(slip: float) -> Swing:
+    """A swing of no amplitude about this slip."""
+    return Swing(slip, slip + 1e-6)
+
+
+def c_and_K_known(soil: str) -> list[str]:
+    """Settings by which c and K of a soil are known to 25 %."""
+    values = {name: getattr(SOILS[soil], name) for name in ("c", "K")}
+    return [f"soil.{name}.{key}={v * f}" for name, v in values.items() for key, f in (("value", 1.0), ("std", 0.25))]
+
+
+def two_wheels(config: Config) -> Config:
+    """The vehicle with one wheel in front and one behind."""
+    return config.model_copy(update={"wheel": config.wheel[::2]})
+
+
+def observed_window(
+    config: Config, soil: str, seconds: float = 10.0, slip: Swing = EXCITED, sinkage: bool = True, seed: int = 1,
+    side_shift: Swing = LEANING,
+) -> ObservationModel:  # fmt: skip
+    """The window of a simulated drive on a soil of the table."""
+    scenario = Scenario(seconds, (Patch(0.0, soil),), slip=slip, side_shift=side_shift)
+    channels = simulate(config, scenario, seed).channels
+    wanted = {name: c for name, c in channels.items() if sinkage or not name.startswith("sinkage")}
+    return service_windows.observed(config, wanted, seconds)
 
 
 def tracker_of(config: Config) -> Tracker:

@@ -4,7 +4,6 @@
                  windows whose status changes,  change of the evaluations of the fits [%]
     diagnosis    cases whose verdict or names change,  greatest change of a name's probability,
                  greatest |change of log pressure| / sd,  change of the model evaluations [%]
-    types        types that get or lose an effect, types of which other vehicles agree, greatest change of a probability
     watch        boggings more or less in time, greatest change of a lead [s], false warnings more or less
     reception    spikes and sound samples refused more or less, windows more or less with data enough, bins of whole
                  recordings [%], windows with another torque limit, greatest change of a moment's slip [0.01] and of a
@@ -12,7 +11,7 @@
     consistency  faults of sensors found more or less, windows more or less in which a sound one is named
 
 Each field of the options is multiplied by 0.7 and by 1.3, counts rounded and changed by at least one, on fixed seeded
-drives, cases, types of vehicles, boggings and faults (`estimates`, `diagnoses`, `types`, `watches`, `receptions`,
+drives, cases, boggings and faults (`estimates`, `diagnoses`, `watches`, `receptions`,
 `contradictions`).  A field of the solver is changed in the joint descent from a cold start, and in other descents where
 they have a value of their own.  `--page` writes the tables of service/docs/sensitivity.md.
 """
@@ -28,7 +27,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, partial
 from inspect import getsource
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,13 +40,10 @@ from soilbus.decision import options as of_watch
 from soilbus.decision.options import WatchOptions
 from soilbus.diagnosis import options as of_diagnosis
 from soilbus.diagnosis.diagnose import NotFitted, diagnose
-from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
-from soilbus.diagnosis.options import DiagnosisOptions, TypeOptions
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record, TooLittle, record_of
-from soilbus.diagnosis.vehicle_type import Factor, SharedEffect, shared_effect
 from soilbus.estimation import options as of_estimator
 from soilbus.estimation.assembly import model_of, possible_effects, prior_of, rig_of
-from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.options import EstimatorOptions, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.tracker import Tracker
@@ -61,18 +56,17 @@ from soilbus.sensors.options import ConsistencyOptions, ReceptionOptions
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import AXLE_MOTORS, REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.terra.earth import SEMI_MAJOR_AXIS
-from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.trials.bogging_trials import Observation, Task, WarningTrial, judged, observed
 from soilbus.trials.boggings import KINDS
 from soilbus.trials.firm_drives import EASY, FIRM_KINDS
 from soilbus.trials.windows import bins_of
 from tests.lab.blind.cases import Case, cases
-from tests.lab.curved_drives import curved
 from tests.lab.driven_windows import task_of, windows
 
 FACTORS = (0.7, 1.3)
+EARTH_RADIUS = 6.378e6
+"""[m]."""
 HEAD = "| option | value | unit | -30 % | +30 % |"
 SWEPT, STEADY = Swing(0.05, 0.40), Swing(0.15, 0.15 + 1e-6)
 SECONDS = 40.0
@@ -112,9 +106,6 @@ DRIVES = {
     "sand": Scenario(10.0, (Patch(0.0, "dry_sand"),), slip=Swing(0.05, 0.7)),
 }
 """Drives with the faults, and without any."""
-GAIN = CATALOGUE["draft_gain"]
-TYPES = tuple(product((2, 3, 8, 40), (0.0, 0.2, 0.45), (0.0, 0.02, 0.1), (0.004, 0.03)))
-"""Arguments of `factors_of_type`: few vehicles and many, equal and unequal ones, a clear value and a small one."""
 
 
 class Field(NamedTuple):
@@ -186,12 +177,11 @@ class Drive(NamedTuple):
 
 @cache
 def drives() -> tuple[Drive, ...]:
-    """Three soils from cold to warm, constant slip, short windows, two borders, a curve, free wheels,
+    """Three soils from cold to warm, constant slip, short windows, two borders, free wheels,
     one motor's speed for two wheels, no load cells, an effect."""
     loam = _drive([], "loam", 11.0)
-    rig, model = rig_of(loam.config), loam.config.model
-    turned = [(curved(w, rig, np.interp(w.t, [5.0, 6.0], [0.0, 1.0 / 25.0])), end) for w, end in loam.windows[:1]]
-    effect = model.model_validate({"effects": [{"name": "slip_sinkage", "exponent": {"value": 0.3, "std": 0.1}}]})
+    slip_sinkage = {"name": "slip_sinkage", "exponent": {"value": 0.3, "std": 0.1}}
+    effect = loam.config.model.model_validate({"effects": [slip_sinkage]})
     return (
         loam,
         _drive([], "wet_clay", 11.0, sinkage=False),
@@ -201,7 +191,6 @@ def drives() -> tuple[Drive, ...]:
         *(_drive(["estimator.window=2"], soil, 2.0, sinkage=False) for soil in ("loam", "wet_clay", "dry_sand")),
         _drive([], "loam", 24.0, then="wet_clay"),
         _drive([], "wet_clay", 24.0, then="loam"),
-        Drive(loam.config, turned),
         _drive([], "loam", 10.0, path=REAR_DRIVE),
         _drive([], "wet_clay", 10.0, path=REAR_DRIVE, wheel_speeds=False),
         _drive([], "wet_clay", 10.0, path=AXLE_MOTORS),
@@ -335,45 +324,6 @@ def change_of_diagnoses(before: Sequence[Diagnosed], after: Sequence[Diagnosed])
     )  # fmt: skip
 
 
-def types(options: TypeOptions) -> list[SharedEffect | None]:
-    """What each type of vehicles shares."""
-    return [shared_effect({GAIN.name: GAIN}, factors_of_type(*one), 4, options) for one in TYPES]
-
-
-def factors_of_type(vehicles: int, share_of_own: float, value: float, std: float) -> list[dict[str, Factor]]:
-    """What a load cell's gain [1] is by the logs of each vehicle: the type's value, or one of its own.
-
-    Parameters
-    ----------
-    vehicles
-        Of the type.
-    share_of_own
-        Expected share of them with a value of their own.
-    value, std
-        Of the others, and of what the logs of one say of it.
-    """
-    rng = np.random.default_rng([vehicles, *(round(1e4 * each) for each in (share_of_own, value, std))])
-    free = tuple(parameters_of(GAIN, 4))
-    information = np.array([[(free[0].std / std) ** 2]])
-    factors = []
-    for _ in range(vehicles):
-        true = 0.15 * rng.normal() if rng.random() < share_of_own else value
-        own = OwnParameters(information, information @ [(true + std * rng.normal()) / free[0].std], free)
-        fall = -mixture_neg2_log_evidence(own.information, own.information_vector, free)
-        factors.append({GAIN.name: Factor({GAIN.name: fall}, 0.0, own)})
-    return factors
-
-
-def change_of_types(before: Sequence[SharedEffect | None], after: Sequence[SharedEffect | None]) -> str:
-    """What moved, in a few words; empty where nothing did."""
-    both = [(a, b) for a, b in zip(before, after, strict=True) if a is not None and b is not None]
-    found = sum((a is None) != (b is None) for a, b in zip(before, after, strict=True))
-    chance = max((abs(a.probability - b.probability) for a, b in both), default=0.0)
-    return _words(
-        (found, "{} found"), (sum(a.vehicles != b.vehicles for a, b in both), "{} vehicles"), (chance, "p {:.2f}")
-    )
-
-
 @cache
 def boggings() -> tuple[tuple[str, Observation], ...]:
     """A bogging of each kind and three drives on firm ground, on four motors and on one; kind and what the watch sees.
@@ -485,7 +435,7 @@ def change_of_receptions(before: Sequence[Heard], after: Sequence[Heard]) -> str
     limits = sum(int((a.limit != b.limit).any(axis=1).sum()) for a, b in pairs)
     bins = max((b.bin_length / a.bin_length - 1.0 for a, b in pairs), key=abs)
     slip = max(float(np.nanmax(np.abs(a.slip - b.slip), initial=0.0)) for a, b in pairs)
-    position = SEMI_MAJOR_AXIS * max(float(np.nanmax(np.abs(a.position - b.position), initial=0.0)) for a, b in pairs)
+    position = EARTH_RADIUS * max(float(np.nanmax(np.abs(a.position - b.position), initial=0.0)) for a, b in pairs)
     return _words(
         (more[2] - more[1], "{:+d} found"), (more[0] + more[1], "{:+d} false"), (enough, "{:+d} enough"),
         (100.0 * bins, "bins {:+.0f} %"), (limits, "{} limits"), (slip, "slip {:.2f}"), (position, "{:.1f} m"),
@@ -567,7 +517,6 @@ def rows(
 TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Callable[[Any, Any], str]], ...] = (
     ("estimator", EstimatorOptions(), estimates, change_of_estimates),
     ("diagnosis", DiagnosisOptions(), diagnoses, change_of_diagnoses),
-    ("types", TypeOptions(), types, change_of_types),
     ("watch", WatchOptions(), watches, change_of_watches),
     ("reception", ReceptionOptions(), receptions, change_of_receptions),
     ("consistency", ConsistencyOptions(), contradictions, change_of_contradictions),

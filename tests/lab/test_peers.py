@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
-from tests.lab.peers import finite_differences, kalman, learned, linear, multiple_models, newton_raphson, ours
+from tests.lab.peers import finite_differences, kalman, learned, linear, newton_raphson, ours
 from tests.lab.peers.command import main
 from tests.lab.peers.compare import compared, ours_is_ahead, tables, verdict
 from tests.lab.peers.roster import OURS, Entry, roster
@@ -42,9 +42,8 @@ def regressor():
 
 @pytest.fixture(scope="module")
 def entries(regressor):
-    """The roster without those that have tests of their own: least_squares (slow, our optimum), multiple models."""
-    elsewhere = (finite_differences.estimate, multiple_models.with_the_soil, multiple_models.without_the_soil)
-    return [entry for entry in roster(regressor) if entry.method not in elsewhere]
+    """The roster without those that have tests of their own: least_squares (slow, our optimum)."""
+    return [entry for entry in roster(regressor) if entry.method is not finite_differences.estimate]
 
 
 @pytest.fixture(scope="module")
@@ -88,22 +87,6 @@ def test_newton_raphson_fails_from_a_poor_start(quiet, monkeypatch):
     case = quiet["loam"].knowing(("c", "n"))
     case.prior.median[PARAMETERS.index("K")] = 3.0
     assert newton_raphson.estimate(case) is None
-
-
-@pytest.mark.parametrize("name", NAMES[:2])
-def test_multiple_models_know_a_soil_of_their_table_and_no_other(name, quiet):
-    right = multiple_models.with_the_soil(quiet[name])
-    assert max(map(abs, off(right, SOILS[name]).values())) < 1e-9
-    wrong = multiple_models.without_the_soil(quiet[name])
-    assert max(map(abs, off(wrong, SOILS[name]).values())) > 0.2
-
-
-def test_multiple_models_average_hypotheses_that_they_cannot_tell_apart(quiet):
-    case = quiet["loam"]
-    hardly = [case.soil._replace(c=case.soil.c * f) for f in (1.0 - 1e-6, 1.0 + 1e-6)]
-    answer = multiple_models.of_hypotheses(case.problem, [*hardly, SOILS["wet_clay"]])
-    assert answer["c"].value == pytest.approx(case.soil.c, rel=1e-7)
-    assert answer["c"].std == pytest.approx(1e-6 * case.soil.c, rel=1e-2)
 
 
 def test_the_filter_is_robust_to_a_wild_reading():

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from soilbus.decision.options import WatchOptions
-from soilbus.diagnosis.options import DiagnosisOptions, TypeOptions
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.estimation.options import EstimatorOptions
 from soilbus.sensors.options import ConsistencyOptions, ReceptionOptions
 from tests.lab.sensitivity import Field, fields_of, with_field
@@ -17,7 +17,6 @@ PAGE = Path(__file__).resolve().parents[2] / "service" / "docs" / "sensitivity.m
 OPTIONS = (
     EstimatorOptions(),
     DiagnosisOptions(),
-    TypeOptions(),
     WatchOptions(),
     ReceptionOptions(),
     ConsistencyOptions(),

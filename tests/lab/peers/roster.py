@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tests.lab.peers import finite_differences, kalman, learned, linear, multiple_models, newton_raphson, ours
+from tests.lab.peers import finite_differences, kalman, learned, linear, newton_raphson, ours
 from tests.lab.peers.windows import Method
 
 __all__ = [
@@ -50,8 +50,6 @@ def roster(regressor: learned.Regressor) -> list[Entry]:
         Entry("linear (Iagnemma, Kang)", linear.estimate, note="K to 25 %"),
         Entry("Newton-Raphson (Hutangkabodee)", newton_raphson.estimate, ("c", "n")),
         Entry("Newton-Raphson (Hutangkabodee)", newton_raphson.estimate, note="c, n to 25 %"),
-        Entry("multiple models (Ray)", multiple_models.with_the_soil, note="a table with the soil"),
-        Entry("multiple models (Ray)", multiple_models.without_the_soil, note="a table without it"),
         Entry("Kalman filter (Li)", kalman.estimate, rest),
         Entry("Kalman filter (Li)", kalman.estimate, note=", ".join(rest) + " to 25 %"),
         Entry("kernel ridge (Xue)", regressor.estimate, note="c, K to 25 %"),
@@ -64,8 +62,6 @@ What each assumes:
   soilbus, least_squares  the sensors' noise and gain errors; a broad prior of every parameter that it is not given
   linear                  triangular stresses; sinkage exact
   Newton-Raphson          Bekker's law with n given, sinkage and slip exact; a modulus for each tyre width
-  multiple models         the soil is one of a table; the sensors' noise, no gain errors
-                          (K in our table is a planning figure, the same for most soils)
   Kalman filter           all but phi and n given; the sensors' noise, no gain errors
   kernel ridge            soils come from the prior; trained on windows of a light generator, tested on the simulator's
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,18 +16,18 @@ from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
 from soilbus.trials import draws
-from tests.lab.bayes_risk_bound import BayesRisk
+from soilbus.trials.draws import prior_about
 from tests.lab.monte_carlo import (
     ROUGHLY_KNOWN,
     Trial,
     as_json,
+    main,
     monte_carlo,
-    prior_about,
+    monte_carlo_report,
     summary,
     tasks_of,
     trials,
 )
-from tests.lab.monte_carlo_report import main, monte_carlo_report
 
 CONFIG = reference_configuration(ROUGHLY_KNOWN)
 
@@ -43,31 +42,6 @@ def made_up(n, spread=1.0, shift=0.0, held=(), seed=0):
         error = bound * (shift + spread * rng.standard_normal(7))
         windows.append(Trial(error, bound, bound, 1.0, True, 0.01))
     return windows
-
-
-def test_the_bayes_risk_bound_is_reported_beside_what_is_attained():
-    rng = np.random.default_rng(3)
-    least = np.array([0.8, 1.5, 1.2])[:, None]
-    made = made_up(400)
-    shown = []
-    for i, window in enumerate(made):
-        weight = rng.uniform(0.1, 2.0) * np.ones((3, 7))
-        risk = weight * least**2 * rng.exponential(1.0, 7)
-        shown.append(replace(window, bayes_risk=BayesRisk(window.error / 1.3, risk, weight, float(i))))
-    cell = summary("loam", 2.0, True, [*shown, *made_up(3, spread=50.0)])
-    assert cell.bayes_risk.windows == 400
-    # the mean of n exponential numbers scatters by 1 / sqrt(n); unlike weights leave fewer of them, uniform ones 3/4
-    assert cell.bayes_risk.least_scatter == pytest.approx(np.full(7, 1.5 * 0.5 / np.sqrt(0.77 * 400)), rel=0.2)
-    assert (np.abs(cell.bayes_risk.least - 1.5) < 3.5 * cell.bayes_risk.least_scatter).all()
-    assert cell.bayes_risk.share == pytest.approx(np.full(7, 1.3))
-    assert cell.bayes_risk.scatter == pytest.approx(np.zeros(7), abs=1e-12)
-    assert cell.bayes_risk.best == pytest.approx(cell.bayes_risk.ours / 1.3)
-    assert cell.bayes_risk.ours == pytest.approx(summary("loam", 2.0, True, made).rms)
-    assert cell.bayes_risk.effective == 199.5
-    figures = (cell.bayes_risk.least[2], cell.bayes_risk.least_scatter[2], cell.bayes_risk.best[2])
-    assert "{:.2f}+-{:.2f} {:.2f} 1.30+-0.00".format(*figures) in monte_carlo_report([cell])
-    of_n = as_json(cell)["quantities"]["n"]
-    assert tuple(of_n[name] for name in ("least", "least_scatter", "best")) == pytest.approx(figures)
 
 
 def test_soils_around_a_named_one_are_drawn_until_the_tractor_gets_on(monkeypatch):
