@@ -282,10 +282,6 @@ def command_line() -> argparse.ArgumentParser:
     figures(sub, "soils, drives, noise and priors")
 
     sub = command("bench", "every performance figure beside its peer, in one run", "")
-    sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
-    sub.add_argument(
-        "--seconds", type=between(15.0, 200.0), default=120.0, metavar="S", help="of a full bus (default 120)"
-    )
     figures(sub)
     return parser
 

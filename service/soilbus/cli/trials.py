@@ -9,7 +9,7 @@ import argparse
 import os
 from contextlib import nullcontext
 
-from soilbus.cli.common import WorkError, configured_or_reference, need_extra, report
+from soilbus.cli.common import WorkError, configured_or_reference, report
 from soilbus.files import whole_file
 
 
@@ -47,16 +47,12 @@ def bench(args: argparse.Namespace) -> None:
     """`soilbus bench`: performance figures beside their peers."""
     import json
 
-    from soilbus.can.bus import BusError
-    from soilbus.trials.bench import as_results, bench_report, run_bench
-    from soilbus.trials.bench.bus import NotMeasured, bus_figures
+    from soilbus.trials.bench import bench_report, run_bench
 
-    if args.bus is None:
-        need_extra("scipy", "peers", "bench")
     with nullcontext() if args.json is None else whole_file(args.json) as out:  # first, for it takes a minute
         try:
-            results = run_bench() if args.bus is None else as_results(bus_figures(args.bus, args.seconds))
-        except (AssertionError, BusError, ModuleNotFoundError, NotMeasured) as error:
+            results = run_bench()
+        except (AssertionError, ModuleNotFoundError) as error:
             raise WorkError(f"bench: {error}") from None
         if out is not None:
             out.write(json.dumps(results, indent=1) + "\n")

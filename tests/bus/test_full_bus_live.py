@@ -1,4 +1,4 @@
-"""`soilbus bench --bus` on a real bus: every figure is measured; those that no busy machine can spoil hold."""
+"""`python -m tests.lab.full_bus` on a real bus: every figure is measured; those that no busy machine can spoil hold."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import Any
 
 import pytest
 
-BENCH = "import sys; from soilbus.cli.main import main; sys.exit(main())"
-
 
 @pytest.fixture(scope="module")
 def figures(vcan_run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-c", BENCH, "bench", "--bus", "vcan0", "--seconds", "15", "--json", out / "bench.json"]
+    command = [sys.executable, "-m", "tests.lab.full_bus", "vcan0", "--seconds", "15", "--json", out / "bench.json"]
     done = vcan_run(command, rw=[out], timeout=180.0)
     assert done.returncode == 0, done.stdout
     return json.loads((out / "bench.json").read_text())["details"]
