@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from soilbus.can.channels import Column
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.observation_model import ObservationModel
@@ -17,6 +18,7 @@ from soilbus.estimation.window import Window
 from soilbus.pipeline.intake import WindowTask
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.sensors import true_readings
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.trials import windows as service_windows
@@ -29,6 +31,7 @@ __all__ = [
     "c_and_K_known",
     "constant",
     "errors",
+    "exact",
     "observed_window",
     "sweep",
     "task_of",
@@ -116,3 +119,10 @@ def sweep(text: str, seeds: int) -> argparse.ArgumentParser:
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--windows", action="store_true")
     return parser
+
+
+def exact(recording: Recording, config: Config, names: Iterable[str]) -> dict[str, Column]:
+    """What sensors without errors and effects would have read at the times of these channels' samples."""
+    truth, times = recording.truth, {name: recording.channels[name].t for name in names}
+    readings = true_readings(truth, config, times)
+    return {name: Column(t, np.interp(t, truth["t"], readings[name])) for name, t in times.items()}

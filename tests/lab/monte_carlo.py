@@ -39,8 +39,9 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 from soilbus.trials.draws import Each, first_drive, prior_about, processes
-from soilbus.trials.windows import bins_of, exact
+from soilbus.trials.windows import bins_of
 from tests.lab.cramer_rao import cramer_rao
+from tests.lab.driven_windows import exact
 
 __all__ = [
     "ROUGHLY_KNOWN",

@@ -57,12 +57,13 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import AXLE_MOTORS, REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.effect import Effect
-from soilbus.trials.bogging_trials import Observation, Task, WarningTrial, judged, observed
+from soilbus.trials.bogging_trials import Task, WarningTrial
 from soilbus.trials.boggings import KINDS
 from soilbus.trials.firm_drives import EASY, FIRM_KINDS
 from soilbus.trials.windows import bins_of
 from tests.lab.blind.cases import Case, cases
 from tests.lab.driven_windows import task_of, windows
+from tests.lab.watched_drives import Observation, judged, observed
 
 FACTORS = (0.7, 1.3)
 EARTH_RADIUS = 6.378e6

@@ -28,9 +28,9 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.wheel import Soil
-from soilbus.trials.windows import bins_of, exact
+from soilbus.trials.windows import bins_of
 from tests.lab.cramer_rao import cramer_rao
-from tests.lab.driven_windows import errors, sweep, task_of, windows
+from tests.lab.driven_windows import errors, exact, sweep, task_of, windows
 
 PAIRS = ("loam:wet_clay", "wet_clay:loam", "loam:clayey_soil_38", "clayey_soil_38:loam")
 BEFORE, AFTER = 15.0, 10.0

@@ -17,11 +17,10 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
-from soilbus.decision.capability import assess
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.laplace import cold_fit
+from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.estimation.window import Rig, pairs
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
 from soilbus.simulator.recording import Recording
@@ -29,8 +28,8 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.trials.draws import Each, first_drive, prior_about
-from soilbus.trials.windows import observed, torque_limits
+from soilbus.trials.draws import Each, first_drive, prior_about, with_prior
+from soilbus.trials.windows import first_window, torque_limits
 
 __all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
 
@@ -106,21 +105,18 @@ def trial(task: Task) -> DraftTrial:
     """Simulate one drive, estimate, predict, and solve for the true draft."""
     config, name, seed = task
     soil, recording = _driven(task)
-    rig, model, settings = rig_of(config), model_of(config), config.traversability
+    rig = rig_of(config)
     prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
-    fit = cold_fit(observed(config, recording.channels, config.estimator.window), prior)
+    window = first_window(config, recording, torque_limits(config, rig))
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
+    model = WheelModel(shear_law=config.model.shear_law)
     truth = true_largest_draft(
-        soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law), np.inf, drivetrain_of(config)
-    )
-    if fit is None or not fit.converged:
+        soil, rig, limit, config.traversability.max_slip, model, np.inf, drivetrain_of(config)
+    )  # fmt: skip
+    predicted = WindowEstimator(with_prior(config, prior)).solve(window).traversability.max_draft
+    if predicted is None:
         return DraftTrial(name, np.nan, np.nan, truth)
-    able, _ = assess(
-        fit.reported.posterior, rig, model, None, torque_limits(config, rig), settings.max_slip, settings.max_sinkage
-    )
-    if able is None:
-        return DraftTrial(name, np.nan, np.nan, truth)
-    return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
+    return DraftTrial(name, predicted.value, predicted.std, truth)
 
 
 def _driven(task: Task) -> tuple[Soil, Recording]:
@@ -137,15 +133,9 @@ def _driven(task: Task) -> tuple[Soil, Recording]:
 
 
 def true_largest_draft(
-    soil: Soil,
-    rig: Rig,
-    torque_limit: Array,
-    max_slip: float,
-    model: WheelModel,
-    max_sinkage: float = np.inf,
-    drivetrain: Drivetrain | None = None,
-    side_shift: float = 0.0,
-) -> float:
+    soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf,
+    drivetrain: Drivetrain | None = None, side_shift: float = 0.0,
+) -> float:  # fmt: skip
     """Largest draft [N] held steadily on level ground; nan where there is none.
 
     Parameters
@@ -188,26 +178,17 @@ def true_largest_draft(
 
     found = solve(
         Situation(
-            t=none,
-            distance=none,
-            ground_speed=none + 1.0,
-            acceleration=none,
-            resistance=none,
-            level_load=each_wheel(free),
-            load_per_draft=each_wheel(drawn - free),
-            upright_load=np.zeros(shape),
-            deviation=np.zeros(shape),
-            radius=each_wheel(rig.radius),
-            width=each_wheel(rig.width),
+            t=none, distance=none, ground_speed=none + 1.0, acceleration=none, resistance=none,
+            level_load=each_wheel(free), load_per_draft=each_wheel(drawn - free),
+            upright_load=np.zeros(shape), deviation=np.zeros(shape),
+            radius=each_wheel(rig.radius), width=each_wheel(rig.width),
             length=each_wheel(np.zeros(len(rig.wheels)) if rig.lengths is None else rig.lengths),
             soil=np.broadcast_to(np.asarray(soil)[:, None, None], (6, *shape)),
-            demand=none + np.inf,
-            slip_limit=slips,
+            demand=none + np.inf, slip_limit=slips, least_draft=none - np.inf,
             torque_limit=np.broadcast_to(limits[:, None], (len(limits), len(slips))),
-            least_draft=none - np.inf,
         ),
         Mechanics(model, ~rig.front, rig.chassis.mass, 0.0, 0.0, drivetrain),
-    )
+    )  # fmt: skip
     usable = found.found & (sinkage(found.entry_angle, rig.radius[:, None]) <= max_sinkage).all(axis=0)
     return float(found.draft[usable].max()) if usable.any() else float("nan")
 

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from soilbus.allocator import keep_freed_memory
-from soilbus.config.model import Config
+from soilbus.config.model import Config, Prior
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
@@ -67,3 +67,11 @@ def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilP
         median = np.asarray(soil) * np.exp(prior.log_std * rng.standard_normal(len(soil)))
         if median[_PHI] < MAX_PHI:
             return SoilPrior(median, prior.log_std)
+
+
+def with_prior(config: Config, prior: SoilPrior) -> Config:
+    """The configuration with another prior of the soil."""
+    std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
+    pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
+    soil = config.soil.model_copy(update={name: Prior(value=value, std=s) for name, value, s in pairs})
+    return config.model_copy(update={"soil": soil})

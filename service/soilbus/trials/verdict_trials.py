@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,18 +23,12 @@ from scipy.special import ndtri
 from scipy.stats import binomtest
 
 from soilbus.arrays import Array
-from soilbus.can.channels import Column
-from soilbus.config.model import Config, Prior
+from soilbus.config.model import Config
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand
-from soilbus.decision.demand import present_demand
-from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
-from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.parametrization import MAX_PHI
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.window import VEHICLE_QUANTITIES, Rig, Window, forward
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.drivetrain import drivetrain_of
 from soilbus.simulator.recording import Recording
@@ -42,8 +36,8 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.trials.draft_trials import true_largest_draft
-from soilbus.trials.draws import Each, first_drive, prior_about
-from soilbus.trials.windows import bins_of, exact, task_of, torque_limits
+from soilbus.trials.draws import Each, first_drive, prior_about, with_prior
+from soilbus.trials.windows import first_window, torque_limits
 
 SOIL_LOG_SD = 0.2
 """Standard deviation of the logarithms of a drive's soil parameters about the table's soil."""
@@ -153,36 +147,37 @@ def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> 
 def trial(task: Task) -> Call:
     """Simulate one drive, estimate, call, and solve for the truth."""
     config, seed = task
-    rig, rng = rig_of(config), np.random.default_rng([seed, 4])
+    rng = np.random.default_rng([seed, 4])
     ground, recording = _driven(config, seed, rng)
-    settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
-    measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
-    with_prior = _with_prior(config, prior_about(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
-    limit = np.fmin(ground.torque_limit, torque_limits(config, rig))
-    task_of_window = task_of(measured, config.estimator.window, with_prior, limit, fresh=True)
-    estimate = WindowEstimator(with_prior).estimate(task_of_window)
-    posterior, status, demand = estimate.result.posterior, estimate.result.status, estimate.demand
-    asked = present_demand(exact, rig.chassis, config.estimator.hop)
-    if posterior is None or asked is None or demand is None:
+    prior = prior_about(prior_of(config), ground.soil, np.random.default_rng([seed, 1]))
+    estimating = _with_settings(with_prior(config, prior), max_sinkage=ground.max_sinkage)
+    limit = np.fmin(ground.torque_limit, torque_limits(config, rig_of(config)))
+    window = WindowEstimator(estimating).estimate(first_window(config, recording, limit))
+
+    def decided(by: Config) -> Traversability:
+        return WindowEstimator(by).decide(window).traversability
+
+    decision = decided(estimating)
+    if decision.probability is None or window.demand is None:
         return Call(ground.name, math.nan, State.UNKNOWN, None, False)
-
-    def judged(by: Settings) -> Traversability:
-        return judge(posterior, status, demand, rig, estimate.model, limit, by)[0]
-
-    decision = judged(settings)
-    if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(decision, demand, rng)) is not None:
-        settings = settings.model_copy(update={"margin": margin})
-        decision = judged(settings)
+    if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(decision, window.demand, rng)) is not None:
+        estimating = _with_settings(estimating, margin=margin)
+        decision = decided(estimating)
     probability = math.nan if decision.probability is None else decision.probability
-    return Call(ground.name, probability, decision.state, decision.limit, _can(config, ground, settings, asked.pull))
+    can = _can(config, ground, estimating.traversability, _asked(recording, config))
+    return Call(ground.name, probability, decision.state, decision.limit, can)
 
 
-def _with_prior(config: Config, prior: SoilPrior) -> Config:
-    """The configuration with another prior of the soil."""
-    std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
-    pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
-    soil = config.soil.model_copy(update={name: Prior(value=value, std=s) for name, value, s in pairs})
-    return config.model_copy(update={"soil": soil})
+def _with_settings(config: Config, **settings: float) -> Config:
+    """The configuration with other settings of the decision."""
+    return config.model_copy(update={"traversability": config.traversability.model_copy(update=settings)})
+
+
+def _asked(recording: Recording, config: Config) -> float:
+    """True draft [N] that is asked for on the level: the mean over the last hop or the window, whichever is larger."""
+    t, draft = recording.truth["t"], recording.truth["draft"]
+    end = min(config.estimator.window, float(t[-1]))
+    return float(max(draft[(t > end - length) & (t <= end)].mean() for length in (end, config.estimator.hop)))
 
 
 def _margin(decision: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
@@ -227,14 +222,6 @@ def _ground(config: Config, rng: np.random.Generator) -> Ground:
     if kind == 2:
         max_sinkage = rng.uniform(*SINKAGE_LIMIT_RANGE)
     return Ground(name, soil, torque_limit, max_sinkage)
-
-
-def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> Window:
-    """The window as measured, or as the vehicle's own quantities truly were at the times of the samples."""
-    columns: Mapping[str, Column] = recording.channels
-    if of_truth:
-        columns = exact(recording, config, [name for name in columns if name in VEHICLE_QUANTITIES])
-    return completed(forward(bins_of(config, columns).window(0.0, config.estimator.window)), rig)
 
 
 def reliability(calls: Sequence[Call]) -> Reliability:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,14 @@ from soilbus.config.model import Config
 from soilbus.diagnosis.joint_fit import Start, fit_jointly
 from soilbus.estimation.assembly import model_of, motors_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import Rig, Window, forward
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording
-from soilbus.simulator.sensors import true_readings
 from soilbus.terra.wheel import Soil
 
 
@@ -29,13 +29,6 @@ def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
     bins = Bins(rig, config.estimator.bin, 0.0)
     bins.add({name: (c.t, c.value) for name in rig.channels if (c := channels.get(name)) is not None})
     return bins
-
-
-def exact(recording: Recording, config: Config, names: Iterable[str]) -> dict[str, Column]:
-    """What sensors without errors and effects would have read at the times of these channels' samples."""
-    truth, times = recording.truth, {name: recording.channels[name].t for name in names}
-    readings = true_readings(truth, config, times)
-    return {name: Column(t, np.interp(t, truth["t"], readings[name])) for name, t in times.items()}
 
 
 def observed(config: Config, channels: Mapping[str, Column], duration: float) -> ObservationModel:
@@ -73,6 +66,14 @@ def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np
         slip={wheel.name: None for wheel in config.wheel},
         torque_limit=torque_limit,
         fresh=fresh,
+    )
+
+
+def first_window(config: Config, recording: Recording, torque_limit: NDArray[np.float64]) -> WindowTask:
+    """The task of a recording's first window, with nothing carried over from before."""
+    window = bins_of(config, recording.channels).window(0.0, config.estimator.window)
+    return task_of(
+        completed(forward(window), rig_of(config)), config.estimator.window, config, torque_limit, fresh=True
     )
 
 
