@@ -272,7 +272,6 @@ def command_line() -> argparse.ArgumentParser:
         "--sinkage", type=between(0.005, 0.2), default=0.05, metavar="M",
         help="of the simulated wheels, 0.005 to 0.2 m; the paper does not print its own (default 0.05)",
     )  # fmt: skip
-    sub.add_argument("--seed", type=natural, default=1, help="of the noise (default 1)")
 
     sub = command("decisions", "what soilbus predicts, beside what simulated drives then do", "optional")
     sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each soil (default 150)")

@@ -17,7 +17,7 @@ def paper(args: argparse.Namespace) -> None:
     """`soilbus paper`: the tables of Xi et al. 2024 beside ours."""
     from soilbus.trials.paper_report import paper_report
 
-    print(paper_report(args.sinkage, args.seed), end="")
+    print(paper_report(args.sinkage), end="")
 
 
 def decisions(args: argparse.Namespace) -> None:

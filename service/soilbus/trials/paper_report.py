@@ -8,8 +8,6 @@ import timeit
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from scipy.optimize import brentq
-
 from soilbus.report.table import table
 from soilbus.trials.paper import (
     AS_PRINTED,
@@ -24,14 +22,10 @@ from soilbus.trials.paper import (
     moduli_from_two_widths,
 )
 from soilbus.trials.paper_corrections import corrections
-from soilbus.trials.paper_noise import LEVELS
-from soilbus.trials.paper_noise_report import K_L_bound, noise_summary, noise_table, noise_text
+from soilbus.trials.paper_noise import LEVELS, K_L_bound, noise_table, noise_text
 from soilbus.trials.paper_tables import (
     RUNS,
-    SANDY_LOAM,
     START_ERRORS,
-    TORQUE_ON_CLAY,
-    TORQUE_ON_LOAM,
     TRACTOR_2,
     TRIALS,
     WET_CLAY,
@@ -52,12 +46,10 @@ PAPER_HEAD = (
 """Columns of the tables of estimates."""
 REPEATS = 20
 """Timed runs, of which the shortest counts."""
-SINKAGE_MARGIN = 1e-6
-"""Distance [m] from zero and from the radius within which no sinkage is looked for."""
 
 
-def paper_report(sinkage: float, seed: int) -> str:
-    """The whole output for a sinkage [m] of the simulated wheels and a seed of the noise."""
+def paper_report(sinkage: float) -> str:
+    """The whole output for a sinkage [m] of the simulated wheels."""
     parts = [
         _title("Xi et al. 2024 (World Electr. Veh. J. 15:217), reproduced"),
         _text(
@@ -72,8 +64,7 @@ def paper_report(sinkage: float, seed: int) -> str:
         _left_over(sinkage),
         _widths(sinkage),
         _other_data(sinkage),
-        _torques(),
-        _title("Noise") + _text(noise_text(sinkage, seed)) + noise_table(sinkage, seed) + _text(noise_summary(sinkage)),
+        _title("Noise") + _text(noise_text(sinkage)) + noise_table(sinkage),
         _corrected(sinkage),
     ]
     return "\n".join(parts)
@@ -120,8 +111,7 @@ def what_holds(sinkage: float) -> list[str]:
         f"The accuracy {_verdict(off <= before)} where data and solver do not share three angles of each branch: "
         f"forces of the exact integrals give {K_L} instead of {truth.K_L / 1e3:.0f} on wet clay.",
         f"Robustness to noise (conclusion 3) {_verdict(bound <= before)}: noise of 0.1 % leaves K_L of wet clay a "
-        f"standard deviation of at least {bound:.0f} %. A window with varied load and slip determines it.",
-        f"Figure 13's torques on the two soils fit {_what_fits()} of tractor 1 at slip 0.2.",
+        f"standard deviation of at least {bound:.0f} %.",
         f"Real time {_verdict(seconds < fastest)}: ours takes at most {seconds:.1e} s, the paper's at least "
         f"{fastest:g} s; see the last two columns of the tables.",
     ]
@@ -129,29 +119,10 @@ def what_holds(sinkage: float) -> list[str]:
 
 MAX_SOLUTION_ERROR = 1e-3
 """Error [%] up to which a solution is the true soil."""
-READING_TOLERANCE = 0.05
-"""Share by which loads, or sinkages, may differ and still be read off a figure as one."""
 
 
 def _verdict(it_is: bool) -> str:
     return "holds" if it_is else "does not hold"
-
-
-def _what_fits() -> str:
-    """What both torques of figure 13 may share."""
-    clay, loam = _place(TORQUE_ON_CLAY, WET_CLAY), _place(TORQUE_ON_LOAM, SANDY_LOAM)
-    one = [
-        f"one {name}"
-        for name, a, b in zip(("sinkage", "load"), clay, loam, strict=True)
-        if abs(a / b - 1) < READING_TOLERANCE
-    ]
-    return " and ".join(one) or "neither one load nor one sinkage"
-
-
-def _place(torque: float, trial: Trial) -> tuple[float, float]:
-    """Sinkage [m] and load [N] at which a wheel needs a torque [N m]."""
-    z = _sinkage_where("T", torque, trial, EXACT)
-    return z, WheelEquations(trial.at(z), EXACT).forces(trial.truth).W
 
 
 def _from_above(trial: Trial, sinkage: float) -> tuple[bool, bool]:
@@ -333,57 +304,6 @@ def _other_data(sinkage: float) -> str:
         )
         + table(("data", *TRIALS), rows)
     )
-
-
-def _torques() -> str:
-    rows = []
-    for z in (0.01, 0.02, 0.05, 0.10, 0.15):
-        cells: list[str] = []
-        for equations in (EXACT, EXACT_EXPONENTIAL):
-            clay, loam = (WheelEquations(t.at(z), equations).forces(t.truth) for t in (WET_CLAY, SANDY_LOAM))
-            cells += [f"{clay.T:.0f}", f"{loam.T:.0f}"]
-        rows.append((f"sinkage {z:.2f} m", *cells))
-    for load in (1e3, 2e3, 4e3, 8e3):
-        cells = []
-        for equations in (EXACT, EXACT_EXPONENTIAL):
-            for trial in (WET_CLAY, SANDY_LOAM):
-                z = _sinkage_where("W", load, trial, equations)
-                cells.append(f"{WheelEquations(trial.at(z), equations).forces(trial.truth).T:.0f}")
-        rows.append((f"load {load:.0f} N", *cells))
-    head = ("T [N m] at equal", "clay, rational", "loam, rational", "clay, exponential", "loam, exponential")
-    return (
-        _title("Figure 13: torque needed (eq. 22), tractor 1, slip 0.2")
-        + _text(
-            f"The paper: about {TORQUE_ON_CLAY:.0f} N m on wet clay, less than {TORQUE_ON_LOAM:.0f} N m on sandy "
-            f"loam; under what load or sinkage, its text does not say."
-        )
-        + table(head, rows)
-        + _text(_where_the_torques_are())
-    )
-
-
-def _where_the_torques_are() -> str:
-    (z_clay, W_clay), (z_loam, W_loam) = _place(TORQUE_ON_CLAY, WET_CLAY), _place(TORQUE_ON_LOAM, SANDY_LOAM)
-    z_other, _ = _place(TORQUE_ON_LOAM, WET_CLAY)
-    exchanged, as_it_is = (
-        WheelEquations(SANDY_LOAM.at(z), EXACT).forces(SANDY_LOAM.truth).T for z in (z_other, z_clay)
-    )
-    closer = abs(math.log(exchanged / TORQUE_ON_CLAY)) < abs(math.log(as_it_is / TORQUE_ON_LOAM))
-    return (
-        f"With the rational law {TORQUE_ON_CLAY:.0f} N m on clay takes {W_clay:.0f} N at {z_clay:.3f} m, "
-        f"{TORQUE_ON_LOAM:.0f} N m on loam {W_loam:.0f} N at {z_loam:.3f} m: {_what_fits()}. "
-        f"Where clay takes {TORQUE_ON_LOAM:.0f} N m ({z_other:.3f} m), loam takes {exchanged:.0f} N m: "
-        f"with the soils exchanged the printed torques {'come' if closer else 'do not come'} closer."
-    )
-
-
-def _sinkage_where(force: str, value: float, trial: Trial, equations: Equations) -> float:
-    """Sinkage [m] at which W or T, both of which grow with it, has a value."""
-
-    def beyond(z: float) -> float:
-        return float(getattr(WheelEquations(trial.at(z), equations).forces(trial.truth), force)) - value
-
-    return float(brentq(beyond, SINKAGE_MARGIN, trial.radius - SINKAGE_MARGIN))
 
 
 def _corrected(sinkage: float) -> str:

@@ -1,4 +1,4 @@
-"""What Xi et al. 2024 (World Electr. Veh. J. 15:217) print: Tables 2-7 and section 5.
+"""What Xi et al. 2024 (World Electr. Veh. J. 15:217) print: Tables 2-7.
 
 Soils of Tables 2 and 5 are in terra/soils.py. Units are the paper's: degrees, kN/m^(n+2), per cent, seconds.
 """
@@ -19,8 +19,6 @@ __all__ = [
     "SINKAGE",
     "SLIP",
     "START_ERRORS",
-    "TORQUE_ON_CLAY",
-    "TORQUE_ON_LOAM",
     "TRACTOR_2",
     "TRIALS",
     "WET_CLAY",
@@ -85,10 +83,6 @@ RUNS = (
 """Tables 3, 4, 6 and 7 as printed."""
 START_ERRORS = {3: 20, 4: 50, 6: 20, 7: 50}
 """What each table says the start values are off by [%]."""
-
-TORQUE_ON_CLAY = 1000.0
-"""Section 5 and Figure 13 [N m]: about this on wet clay, less than the next on sandy loam."""
-TORQUE_ON_LOAM = 200.0
 
 
 def from_print(values: tuple[float, float, float]) -> Unknowns:
