@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import soilbus.trials.bench as bench
 from soilbus.cli.main import main
+from soilbus.estimation.posterior import PARAMETERS
 from soilbus.trials.bench import growth, paper, service, window
 from soilbus.trials.bench.figure import Figure, in_turn
 
@@ -105,9 +106,11 @@ def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known)
     assert [*np.array(["k_c", "k_phi", "n", "phi", "c", "K"])[problem.prior.free]] == [
         x for x in ("k_c", "k_phi", "n", "phi", "c", "K") if x != exact
     ]
-    assert problem.start._asdict()[rough] == pytest.approx(1.25 * window.soil_named(name)._asdict()[rough])
+    assert problem.prior.median[PARAMETERS.index(rough)] == pytest.approx(
+        1.25 * window.soil_named(name)._asdict()[rough]
+    )
     ours = window.fit_window(*problem)
-    peer = window.by_finite_differences(problem)
+    peer = window.by_finite_differences(*problem)
     assert window.distance(problem, ours, peer) < 0.02
 
 
@@ -155,11 +158,6 @@ def test_windows_grow_as_they_are_said_to():
         for (problem, _), length in zip(growth.problems(wheels), growth.WINDOW_LENGTHS, strict=True):
             assert (problem.n, problem.n_wheels) == (10 * length, wheels)
             assert problem.n_rows == problem.n * (2 * wheels + 1)  # torque and sinkage of each wheel, one balance
-
-
-def test_a_straight_line_is_found_and_its_slope_is_the_cost_of_a_wheel_instant():
-    size = np.array([50.0, 200.0, 800.0, 3200.0])
-    assert growth.line(size, 1e-3 + 3e-6 * size) == pytest.approx((1e-3, 3e-6))
 
 
 def test_times_are_taken_in_turn_and_the_least_counts():

@@ -37,10 +37,7 @@ Measurement = Callable[[Path], Mapping[str, Figure]]
 
 MEASUREMENTS: tuple[Measurement, ...] = (
     lambda log: {"decode_speedup": decode.decode_speedup(log)},
-    lambda log: {
-        "replay_realtime_factor": replay.replay_realtime_factor(log, RECORDING_TIME),
-        "replay_one_core_factor": replay.replay_one_core_factor(log, RECORDING_TIME),
-    },
+    lambda log: replay.replay_factors(log, RECORDING_TIME),
     lambda _: {"paper_solve_speedup": paper.paper_solve_speedup()},
     lambda _: {"window_solve_speedup": window.window_solve_speedup()},
     service.window_times,

@@ -17,31 +17,16 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.trials.bench.figure import Figure, in_turn, wall_time
 
 
-def replay_realtime_factor(log: Path, seconds: float) -> Figure:
+def replay_factors(log: Path, seconds: float) -> dict[str, Figure]:
     """Replay of a log of `seconds` [s] with a hop of 1 s, beside reading it with python-can."""
     config = reference_configuration()
 
-    def whole() -> None:
+    def beside() -> None:
         with estimator_beside(config) as workers:
             for _ in replay(Pipeline(config, load_databases(config)), [log], workers=workers):
                 pass
 
-    def only_read() -> None:
-        for _ in read_log(log):
-            pass
-
-    ours, peer = wall_time(whole, 3), wall_time(only_read, 3)
-    return Figure(
-        seconds / ours, 150.0, f"reading alone {peer:.2f} s, whole replay {ours:.2f} s",
-        f"{seconds:.0f} s, four wheels, 1 s hop",
-    )  # fmt: skip
-
-
-def replay_one_core_factor(log: Path, seconds: float) -> Figure:
-    """As `replay_realtime_factor`, by processor time of one process."""
-    config = reference_configuration()
-
-    def whole() -> None:
+    def alone() -> None:
         for _ in replay(Pipeline(config, load_databases(config)), [log]):
             pass
 
@@ -49,8 +34,14 @@ def replay_one_core_factor(log: Path, seconds: float) -> Figure:
         for _ in read_log(log):
             pass
 
-    ours, peer = in_turn((whole, only_read), 3)
-    return Figure(
-        float(seconds / ours), 300.0, f"processor time: reading alone {peer:.2f} s, whole replay {ours:.2f} s",
-        f"{seconds:.0f} s, four wheels, 1 s hop, one process",
-    )  # fmt: skip
+    what = f"{seconds:.0f} s, four wheels, 1 s hop"
+    wall, (one_core, reading) = wall_time(beside, 3), in_turn((alone, only_read), 3).tolist()
+    return {
+        "replay_realtime_factor": Figure(
+            seconds / wall, 150.0, f"reading alone {wall_time(only_read, 3):.2f} s, whole replay {wall:.2f} s", what
+        ),
+        "replay_one_core_factor": Figure(
+            seconds / one_core, 300.0,
+            f"processor time: reading alone {reading:.2f} s, whole replay {one_core:.2f} s", f"{what}, one process",
+        ),
+    }  # fmt: skip
