@@ -11,7 +11,6 @@ warning is false. Seeds are even; thresholds are set on drives with odd ones.
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -28,7 +27,7 @@ from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
 from soilbus.trials.boggings import KINDS, BoggingDrive, bogging
-from soilbus.trials.draws import Each
+from soilbus.trials.draws import Each, seeds_of
 from soilbus.trials.firm_drives import DRIVE_TIME, EASY, FIRM_KINDS, HARD, firm_ground
 from soilbus.trials.windows import bins_of, task_of, torque_limits
 
@@ -52,20 +51,10 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WarningTrial:
-    """One drive.
+    """One drive: seconds watched and warnings begun before slip passed its limit.
 
-    Attributes
-    ----------
-    kind
-        Of boggings.KINDS or firm_drives.FIRM_KINDS.
-    seconds
-        Time watched [s].
-    warnings
-        Warnings begun before slip passed its limit.
-    lead, distance
-        Of the last warning [s], [m]; nan where slip never passed, or passed before MIN_DRIVE_TIME; 0 without a warning.
-    possible, possible_distance
-        Time [s] and distance [m] from the first perceptible loss of draft, or the first window, until slip passed.
+    lead [s] and distance [m] are of the last warning: nan where slip never passed, or within MIN_DRIVE_TIME; 0 without
+    a warning. possible and possible_distance are those from the first perceptible loss of draft, or the first window.
     """
 
     kind: str
@@ -93,18 +82,10 @@ class WarningTrial:
 
 @dataclass(frozen=True, slots=True)
 class WarningFigures:
-    """Figures of one kind.
+    """Figures of one kind: predictable boggings, how many were warned of in time, median and least lead [s].
 
-    Attributes
-    ----------
-    boggings, warned
-        Predictable boggings, and those warned of early enough.
-    lead, least
-        Median and least lead [s].
-    sudden, delay
-        Boggings that were too sudden, and the median delay [s] of their warnings behind the first perceptible loss.
-    hours, false
-        On firm ground: hours and false warnings.
+    `sudden` boggings leave no time, and `delay` is the median time [s] of their warnings after the first perceptible
+    loss. On firm ground: hours and false warnings.
     """
 
     kind: str
@@ -119,16 +100,9 @@ class WarningFigures:
 
 
 class Drive(NamedTuple):
-    """When a simulated drive is watched, and how it ends.
+    """Start and end [s] of the time watched; the end is when slip passes its limit (`passed`), or that of the drive.
 
-    Attributes
-    ----------
-    start, end
-        Of the watched time [s]; it ends when slip passes its limit (`passed`), or with the drive.
-    t, distance
-        Times [s] and distances driven [m] (N,).
-    felt
-        Time [s] of the first perceptible loss of draft.
+    t [s] and distance driven [m] (N,); `felt` is the time [s] of the first perceptible loss of draft.
     """
 
     start: float
@@ -208,32 +182,15 @@ def rated(kind: str, seen: Drive, begins: Sequence[float], holds: bool) -> Warni
 def warning_trials(
     config: Config, boggings: int, hours: float, seed: int, each: Each = map
 ) -> tuple[WarningFigures, ...]:
-    """Figures of simulated boggings and of hours without one.
+    """Figures of drives into trouble, evenly of all kinds, and of hours on firm ground, half of them on hard drives.
 
-    Parameters
-    ----------
-    config
-        The vehicle.
-    boggings
-        Number of drives into trouble, evenly of all kinds.
-    hours
-        Hours on firm ground, half of them on hard drives.
-    seed
-        The same seed gives the same drives.
-    each
-        The built-in map, or that of draws.processes.
-
-    Raises
-    ------
-    SimulationError
-        The vehicle cannot be driven.
+    Raises SimulationError where the vehicle cannot be driven.
     """
     firm = math.ceil(3600.0 * hours / (DRIVE_TIME - config.estimator.window))
     kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
         HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
     ]
-    key = np.random.SeedSequence([seed, zlib.crc32(b"warnings")])
-    seeds = [int(s) // 2 * 2 for s in key.generate_state(len(kinds))]
+    seeds = [s // 2 * 2 for s in seeds_of(seed, "warnings", len(kinds))]
     trials = list(each(trial, [Task(config, kind, s) for kind, s in zip(kinds, seeds, strict=True)]))
     return tuple(
         figures(kind, found)
@@ -249,14 +206,8 @@ def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
     rest = [t for t in trials if t.kind in FIRM_KINDS]
     leads = np.array([t.lead for t in asked])
     delays = [t.possible - t.lead for t in bogged if t.sudden]
-    return WarningFigures(
-        kind=kind,
-        boggings=len(asked),
-        warned=sum(t.in_time for t in asked),
-        lead=float(np.median(leads)) if len(asked) else float("nan"),
-        least=float(leads.min()) if len(asked) else float("nan"),
-        sudden=len(delays),
-        delay=float(np.median(delays)) if delays else float("nan"),
-        hours=sum(t.seconds for t in rest) / 3600.0,
-        false=sum(t.warnings for t in rest),
-    )
+    lead, least = (float(of(leads)) if len(asked) else math.nan for of in (np.median, np.min))
+    delay = float(np.median(delays)) if delays else math.nan
+    hours, false = sum(t.seconds for t in rest) / 3600.0, sum(t.warnings for t in rest)
+    warned = sum(t.in_time for t in asked)
+    return WarningFigures(kind, len(asked), warned, lead, least, len(delays), delay, hours, false)

@@ -59,23 +59,9 @@ class BoggingDrive(NamedTuple):
 
 
 def bogging(config: Config, kind: str, rng: np.random.Generator) -> BoggingDrive:
-    """A drive that is meant to end stuck.
+    """A drive of one of KINDS that is meant to end stuck; `rng` picks soils, lengths and drafts.
 
-    Parameters
-    ----------
-    config
-        The vehicle.
-    kind
-        One of KINDS.
-    rng
-        Picks soils, lengths and drafts.
-
-    Raises
-    ------
-    SimulationError
-        The vehicle cannot be driven.
-    ValueError
-        Another kind.
+    Raises SimulationError where the vehicle cannot be driven, ValueError for another kind.
     """
     firm = str(rng.choice(SLIPPING_SOILS if kind in ("draft", "grade", "uneven_draft") else FIRM_SOILS))
     side = side_shift(config, firm, SIDE_SHIFT)

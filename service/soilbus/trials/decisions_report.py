@@ -20,7 +20,7 @@ from soilbus.trials.bogging_trials import (
 )
 from soilbus.trials.draft_trials import SOIL_LOG_SD, DraftFigures
 from soilbus.trials.firm_drives import EASY, HARD
-from soilbus.trials.verdict_trials import Bin, Reliability
+from soilbus.trials.verdict_trials import Reliability
 
 SHARED = """The drives are simulated with the estimator's own wheel-soil model, noise and priors about the true soil:
 the figures show that numbers and intervals follow from the model, not that the model is the field's."""
@@ -40,7 +40,14 @@ def _call_section(found: Reliability) -> Iterator[str]:
     yield "Probability that the present demand and its margin can be met, beside how often it truly can"
     yield ""
     head = ("probability", "calls", "mean", "came true", "95 % interval", "")
-    yield table(head, [_call_row(of_bin) for of_bin in found.bins if of_bin.calls])
+    rows = [
+        (
+            f"{b.low:.1f} to {b.high:.1f}", str(b.calls), f"{b.mean:.3f}", f"{b.true:.3f}",
+            f"{b.least:.3f} to {b.most:.3f}", "" if b.least <= b.mean <= b.most else "*",
+        )
+        for b in found.bins if b.calls
+    ]  # fmt: skip
+    yield table(head, rows)
     yield (
         f"{found.drives} drives, {found.failed} without a call.  Brier score {found.brier:.4f}, "
         f"{found.brier_expected:.4f} +- {found.brier_std:.4f} if calibrated;"
@@ -49,25 +56,19 @@ def _call_section(found: Reliability) -> Iterator[str]:
     yield f"{found.wrong_go} times, {found.wrong_go_expected:.2f} expected.  * marks a mean outside its interval."
 
 
-def _call_row(of_bin: Bin) -> tuple[str, ...]:
-    astray = "" if of_bin.least <= of_bin.mean <= of_bin.most else "*"
-    return (
-        f"{of_bin.low:.1f} to {of_bin.high:.1f}",
-        str(of_bin.calls),
-        f"{of_bin.mean:.3f}",
-        f"{of_bin.true:.3f}",
-        f"{of_bin.least:.3f} to {of_bin.most:.3f}",
-        astray,
-    )
-
-
 def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     least = f"{MIN_LEAD_TIME:g} s or {MIN_LEAD_DISTANCE:g} m"
     yield f"Warning of immobilisation at least {least} before slip passes its limit"
     yield ""
-    boggings = [found for found in warnings if found.boggings or found.sudden]
     head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden", "warned after")
-    yield table(head, [_bogging_row(found) for found in boggings])
+    rows = [
+        (
+            w.kind, str(w.boggings), str(w.warned), _seconds(w.lead), _seconds(w.least), str(w.sudden),
+            _seconds(w.delay),
+        )
+        for w in warnings if w.boggings or w.sudden
+    ]  # fmt: skip
+    yield table(head, rows)
     yield "Target: all that can be predicted in time.  Too sudden: from where the ground has lost"
     lost = f"{100.0 * PERCEPTIBLE_DRAFT_LOSS:.0f} % of the largest draft"
     yield f"{lost}, slip passes in less than that and {REACTION_TIME:g} s to react."
@@ -99,8 +100,7 @@ def _pooled(firm: Sequence[WarningFigures]) -> dict[str, _Pooled]:
     """Easy and hard drives, of which there are any."""
     out = {}
     for name, kinds in {"easy": (EASY,), "hard": HARD}.items():
-        found = [f for f in firm if f.kind in kinds]
-        hours, false = sum(f.hours for f in found), sum(f.false for f in found)
+        hours, false = (sum(getattr(f, of) for f in firm if f.kind in kinds) for of in ("hours", "false"))
         if hours:
             least, most = poisson_interval(false)
             out[name] = _Pooled(hours, false, false / hours, least / hours, most / hours)
@@ -113,13 +113,6 @@ def poisson_interval(count: int) -> tuple[float, float]:
     return least, float(gammaincinv(count + 1, 0.975))
 
 
-def _bogging_row(found: WarningFigures) -> tuple[str, ...]:
-    return (
-        found.kind, str(found.boggings), str(found.warned), _seconds(found.lead), _seconds(found.least),
-        str(found.sudden), _seconds(found.delay),
-    )  # fmt: skip
-
-
 def _seconds(value: float) -> str:
     return f"{value:.1f} s" if math.isfinite(value) else "-"
 
@@ -129,21 +122,16 @@ def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
     yield "Largest draft on the level, predicted from one window"
     yield ""
     head = ("soil", "drives", "failed", "true", "|error|", "bias", "in 95 %")
-    yield table(head, [_draft_row(of_soil) for of_soil in drafts])
+    rows = [
+        (
+            d.soil, str(d.drives), str(d.failed), f"{d.true:.0f} N", f"{100.0 * d.error:.2f} %",
+            f"{100.0 * d.bias:+.2f} %", f"{100.0 * d.coverage:.1f}",
+        )
+        for d in drafts
+    ]  # fmt: skip
+    yield table(head, rows)
     yield f"Medians; targets: error at most {100.0 * MAX_ERROR:.0f} %, {low:.0f} to {high:.0f} % of 95 % intervals hold"
     yield f"the truth.  Each drive's soil leaves the named one by {100.0 * SOIL_LOG_SD:.0f} % in every parameter."
-
-
-def _draft_row(of_soil: DraftFigures) -> tuple[str, ...]:
-    return (
-        of_soil.soil,
-        str(of_soil.drives),
-        str(of_soil.failed),
-        f"{of_soil.true:.0f} N",
-        f"{100.0 * of_soil.error:.2f} %",
-        f"{100.0 * of_soil.bias:+.2f} %",
-        f"{100.0 * of_soil.coverage:.1f}",
-    )
 
 
 def as_json(

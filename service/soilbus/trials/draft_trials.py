@@ -2,13 +2,12 @@
 
     relative error = predicted / true - 1,    covered if |predicted - true| < 1.96 std
 
-Each drive has a soil of its own near a named one, works at moderate slips, and is estimated from one window without
-any earlier one. The true largest draft is solved by the simulator's equilibrium at 50 slips.
+Each drive has its own soil near a named one and is estimated from one window. The true largest draft is solved by the
+simulator's equilibrium at 50 slips.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,12 +22,10 @@ from soilbus.estimation.window import Rig, pairs
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
-from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.trials.draws import Each, first_drive, prior_about, with_prior
+from soilbus.trials.draws import Each, drawn_soil, first_drive, prior_about, seeds_of, with_prior
 from soilbus.trials.windows import first_window, torque_limits
 
 __all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
@@ -74,29 +71,10 @@ class DraftFigures:
 
 
 def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> Iterator[DraftFigures]:
-    """Figures of each of SOILS, then of all.
-
-    Parameters
-    ----------
-    config
-        The vehicle.
-    drives
-        Number on each soil.
-    seed
-        The same seed gives the same drives.
-    each
-        The built-in map, or that of draws.processes.
-
-    Raises
-    ------
-    SimulationError
-        The tractor cannot drive on one.
-    """
+    """Figures of `drives` drives on each of SOILS, then of all; SimulationError where the vehicle cannot drive."""
     everything: list[DraftTrial] = []
     for name in SOILS:
-        key = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
-        tasks = [Task(config, name, int(s)) for s in key.generate_state(drives)]
-        everything += (of_soil := list(each(trial, tasks)))
+        everything += (of_soil := list(each(trial, [Task(config, name, s) for s in seeds_of(seed, name, drives)])))
         yield figures(name, of_soil)
     yield figures("all", everything)
 
@@ -104,8 +82,13 @@ def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> It
 def trial(task: Task) -> DraftTrial:
     """Simulate one drive, estimate, predict, and solve for the true draft."""
     config, name, seed = task
-    soil, recording = _driven(task)
-    rig = rig_of(config)
+    rig, rng = rig_of(config), np.random.default_rng([seed, 2])
+
+    def draw() -> tuple[Soil, Scenario]:
+        soil, slip = drawn_soil(name, SOIL_LOG_SD, rng), Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+        return soil, Scenario(config.estimator.window, (Patch(0.0, name, soil),), slip=slip)
+
+    soil, recording = first_drive(config, draw, seed)
     prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
     window = first_window(config, recording, torque_limits(config, rig))
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
@@ -119,19 +102,6 @@ def trial(task: Task) -> DraftTrial:
     return DraftTrial(name, predicted.value, predicted.std, truth)
 
 
-def _driven(task: Task) -> tuple[Soil, Recording]:
-    """The first soil drawn about the named one on which the vehicle gets on, and the drive over it."""
-    config, name, seed = task
-    rng = np.random.default_rng([seed, 2])
-
-    def draw() -> tuple[Soil, Scenario]:
-        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
-        slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
-        return soil, Scenario(config.estimator.window, (Patch(0.0, name, soil),), slip=slip)
-
-    return first_drive(config, draw, seed)
-
-
 def true_largest_draft(
     soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf,
     drivetrain: Drivetrain | None = None, side_shift: float = 0.0,
@@ -140,16 +110,10 @@ def true_largest_draft(
 
     Parameters
     ----------
-    soil, rig
-        Ground and vehicle.
     torque_limit
         Of the wheels (W,) [N m]; nan for none.
-    max_slip
-        Greatest slip.
-    model
-        Wheel-soil model.
-    max_sinkage
-        Greatest sinkage of a wheel [m].
+    max_slip, max_sinkage
+        Greatest slip and sinkage [m] of a wheel.
     drivetrain
         What turns the wheels, with the limits of axles; by default a motor for each wheel.
     side_shift
@@ -199,13 +163,6 @@ def figures(soil: str, trials: Sequence[DraftTrial]) -> DraftFigures:
     predicted, std, true = (np.array([getattr(t, of) for t in good]) for of in ("predicted", "std", "true"))
     if not good:
         return DraftFigures(soil, len(trials), len(trials), *[float("nan")] * 4)
-    error = predicted / true - 1.0
-    return DraftFigures(
-        soil=soil,
-        drives=len(trials),
-        failed=len(trials) - len(good),
-        error=float(np.median(np.abs(error))),
-        bias=float(np.median(error)),
-        coverage=float(np.mean(np.abs(predicted - true) < NORMAL_95 * std)),
-        true=float(np.median(true)),
-    )
+    error, held = predicted / true - 1.0, np.abs(predicted - true) < NORMAL_95 * std
+    middle = float(np.median(np.abs(error))), float(np.median(error)), float(np.mean(held)), float(np.median(true))
+    return DraftFigures(soil, len(trials), len(trials) - len(good), *middle)

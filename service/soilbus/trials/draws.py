@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
@@ -16,6 +17,7 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Scenario
+from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 from soilbus.workers import workers
 
@@ -67,6 +69,19 @@ def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilP
         median = np.asarray(soil) * np.exp(prior.log_std * rng.standard_normal(len(soil)))
         if median[_PHI] < MAX_PHI:
             return SoilPrior(median, prior.log_std)
+
+
+def drawn_soil(name: str, log_sd: float, rng: np.random.Generator) -> Soil:
+    """A soil whose parameters are log-normal about those of the table, with an angle that the model can have."""
+    while True:
+        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(log_sd * rng.standard_normal(len(PARAMETERS)))).tolist())
+        if soil.phi < MAX_PHI:
+            return soil
+
+
+def seeds_of(seed: int, name: str, count: int) -> list[int]:
+    """Seeds of `count` drives of a kind, which do not depend on those of other kinds."""
+    return [int(s) for s in np.random.SeedSequence([seed, zlib.crc32(name.encode())]).generate_state(count)]
 
 
 def with_prior(config: Config, prior: SoilPrior) -> Config:

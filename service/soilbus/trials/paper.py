@@ -4,9 +4,8 @@
     Newton: x <- x - J^-1 (F(x) - F measured),   x = (K_L, phi, n)       (eqs. 34-42)
 
 Load, drawbar pull and torque at a known sinkage and slip are solved for K_L, phi and n. The integrals are Simpson sums
-over three angles of each branch (eqs. 23-33). Misprints are corrected as trials/paper_corrections.py lists;
-`Equations` selects what is printed where that makes a difference. The method is here to be compared with: one
-operating point hardly separates K_L from n (trials/paper_noise.py).
+over three angles of each branch (eqs. 23-33). Misprints are corrected as service/docs/equations.md lists. The method is
+here to be compared with: one operating point hardly separates K_L from n.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel import EXACT_NODES
 
 __all__ = [
-    "AS_PRINTED",
     "EXACT",
     "EXACT_EXPONENTIAL",
     "SIMPSON",
@@ -87,23 +85,15 @@ class Forces(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """Which equations: the integration rule, the shear law, and misprints left in.
-
-    rule is "simpson" (eqs. 23-33) or "gauss" (the integrals themselves, to 1e-10).
-    printed_A4 swaps the weights of A4 as eq. 27 has it; printed_slip_velocity integrates
-    eq. 14, V_j = r omega cos(theta), instead of eq. 15.
-    """
+    """Rule "simpson" (eqs. 23-33) or "gauss" (the integrals themselves, to 1e-10), and shear law."""
 
     rule: str = "simpson"
     shear_law: str = "rational"
-    printed_A4: bool = False
-    printed_slip_velocity: bool = False
 
 
 SIMPSON = Equations()
 EXACT = Equations(rule="gauss")
 EXACT_EXPONENTIAL = Equations(rule="gauss", shear_law="exponential")
-AS_PRINTED = Equations(printed_A4=True)
 
 
 class Solution(NamedTuple):
@@ -136,16 +126,14 @@ class WheelEquations:
         if not 0.0 < z0 < r:
             raise ValueError(f"a sinkage of {z0:g} m is not between 0 and the radius {r:g} m")
         theta = entry_angle(point)
-        share, weight, of_normal = _nodes(equations.rule, equations.printed_A4)
+        share, weight, of_normal = _nodes(equations.rule)
         angle = theta * share
         directions = np.empty((3, *share.shape))  # of shear stress in W, DP and T
         sin, cos = np.sin(angle, directions[0]), np.cos(angle, directions[1])
         directions[2] = 1.0
         carried = 1.0 - slip
-        if equations.printed_slip_velocity:
-            j = math.sin(theta) - sin
-        else:  # eq. 16 as terra.stress has it, over r, with the sines at hand
-            j = carried * sin - angle + (theta - carried * math.sin(theta))
+        # eq. 16 as terra.stress has it, over r, with the sines at hand
+        j = carried * sin - angle + (theta - carried * math.sin(theta))
         law = equations.shear_law
         mobilised = j / (j + K / r) if law == "rational" else SHEAR_LAWS[law](j * (r / K))[0]
         fields = np.empty((5, *share.shape))  # normal stress in DP and W; shear in W, DP and T
@@ -282,7 +270,7 @@ def _triple(u: Three, v: Three, w: Three) -> float:
 
 
 @cache
-def _nodes(rule: str, printed_A4: bool) -> tuple[Array, Array, Array]:
+def _nodes(rule: str) -> tuple[Array, Array, Array]:
     """Angles as shares of the entry angle and weights (2, M), and weights (2, 2, M) of normal stress in DP and W.
 
     Front branch from the entry, then rear branch from the exit, both to the middle (eq. 19).
@@ -292,7 +280,4 @@ def _nodes(rule: str, printed_A4: bool) -> tuple[Array, Array, Array]:
     else:
         share = np.array([[1.0, 0.75, 0.5], [0.0, 0.25, 0.5]])
         weight = np.array([[1.0, 4.0, 1.0], [1.0, 4.0, 1.0]]) / 12.0
-    of_normal = np.stack([-weight, weight])
-    if printed_A4:
-        of_normal[0, 1] = of_normal[0, 1, [0, 2, 1]]
-    return share, weight, of_normal
+    return share, weight, np.stack([-weight, weight])

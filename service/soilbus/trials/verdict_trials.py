@@ -3,17 +3,14 @@
     Brier score = mean((probability - outcome)^2)
     expected    = mean(p (1 - p))  if calls of p come true with frequency p
 
-Each drive has its own soil near one of the table, its own slips, draft, torque and sinkage limits, and ends in one
-call: a probability and a state from one window by the service's own estimator. The truth is solved by the simulator's
-equilibrium for the demand without noise. Most demands are far from the limit, where any call is easy, so three drives
-in four ask for a margin drawn from the estimate, which makes all probabilities about equally frequent. The margin
-depends on the measurements alone, so a calibrated estimator still finds calls of p come true with frequency p.
+Each drive has its own soil near one of the table, its own slips and limits, and ends in one call of the service from
+one window. The truth is solved by the simulator's equilibrium. Three drives in four ask for a margin drawn from the
+estimate, which makes all probabilities about equally frequent; calibrated calls of p still come true with frequency p.
 """
 
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -28,15 +25,14 @@ from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
-from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.drivetrain import drivetrain_of
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.terra.soils import KINDS, soil_named
+from soilbus.terra.soils import KINDS
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.trials.draft_trials import true_largest_draft
-from soilbus.trials.draws import Each, first_drive, prior_about, with_prior
+from soilbus.trials.draws import Each, drawn_soil, first_drive, prior_about, seeds_of, with_prior
 from soilbus.trials.windows import first_window, torque_limits
 
 SOIL_LOG_SD = 0.2
@@ -97,16 +93,9 @@ class Bin:
 class Reliability:
     """All calls.
 
-    Attributes
-    ----------
-    brier
-        Mean square of probability less outcome.
-    brier_expected, brier_std
-        Its mean and sd if calls of p come true with frequency p.
-    excess
-        Outcomes less the sum of the probabilities, over its sd.
-    wrong_go, wrong_go_expected
-        Drives called go that cannot meet the demand, and their number expected from the probabilities.
+    brier is the mean square of probability less outcome, brier_expected and brier_std its mean and sd if calls of p
+    come true with frequency p; excess is outcomes less the sum of the probabilities, over its sd; wrong_go counts
+    drives called go that cannot meet the demand, wrong_go_expected is their number by the probabilities.
     """
 
     drives: int
@@ -122,33 +111,21 @@ class Reliability:
 
 
 def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> Reliability:
-    """Figures of simulated calls.
-
-    Parameters
-    ----------
-    config
-        The vehicle.
-    drives
-        Number of calls.
-    seed
-        The same seed gives the same drives.
-    each
-        The built-in map, or that of draws.processes.
-
-    Raises
-    ------
-    SimulationError
-        The vehicle cannot be driven.
-    """
-    key = np.random.SeedSequence([seed, zlib.crc32(b"verdicts")])
-    return reliability(list(each(trial, [Task(config, int(s)) for s in key.generate_state(drives)])))
+    """Figures of `drives` simulated calls; SimulationError where the vehicle cannot be driven."""
+    return reliability(list(each(trial, [Task(config, s) for s in seeds_of(seed, "verdicts", drives)])))
 
 
 def trial(task: Task) -> Call:
     """Simulate one drive, estimate, call, and solve for the truth."""
     config, seed = task
     rng = np.random.default_rng([seed, 4])
-    ground, recording = _driven(config, seed, rng)
+
+    def draw() -> tuple[Ground, Scenario]:
+        ground = _ground(config, rng)
+        slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+        return ground, Scenario(config.estimator.window, (Patch(0.0, ground.name, ground.soil),), slip=slip)
+
+    ground, recording = first_drive(config, draw, seed)
     prior = prior_about(prior_of(config), ground.soil, np.random.default_rng([seed, 1]))
     estimating = _with_settings(with_prior(config, prior), max_sinkage=ground.max_sinkage)
     limit = np.fmin(ground.torque_limit, torque_limits(config, rig_of(config)))
@@ -190,31 +167,16 @@ def _margin(decision: Traversability, demand: Demand, rng: np.random.Generator) 
 
 def _can(config: Config, ground: Ground, settings: Settings, asked: float) -> bool:
     """Whether the soil truly holds the pull asked for [N] and its margin within all limits."""
-    model = WheelModel(shear_law=config.model.shear_law)
     most = true_largest_draft(
-        ground.soil, rig_of(config), ground.torque_limit, settings.max_slip, model, ground.max_sinkage,
-        drivetrain_of(config),
+        ground.soil, rig_of(config), ground.torque_limit, settings.max_slip,
+        WheelModel(shear_law=config.model.shear_law), ground.max_sinkage, drivetrain_of(config),
     )  # fmt: skip
     return most >= asked + settings.margin * max(asked, 0.0)
 
 
-def _driven(config: Config, seed: int, rng: np.random.Generator) -> tuple[Ground, Recording]:
-    """The first ground drawn that the vehicle can cross for a window, and the drive over it."""
-
-    def draw() -> tuple[Ground, Scenario]:
-        ground = _ground(config, rng)
-        slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
-        return ground, Scenario(config.estimator.window, (Patch(0.0, ground.name, ground.soil),), slip=slip)
-
-    return first_drive(config, draw, seed)
-
-
 def _ground(config: Config, rng: np.random.Generator) -> Ground:
     name = str(rng.choice(KINDS))
-    while True:
-        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
-        if soil.phi < MAX_PHI:
-            break
+    soil = drawn_soil(name, SOIL_LOG_SD, rng)
     torque_limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     max_sinkage, kind = config.traversability.max_sinkage, rng.integers(3)
     if kind == 1:
@@ -232,18 +194,14 @@ def reliability(calls: Sequence[Call]) -> Reliability:
     n, spread = max(len(made), 1), p * (1.0 - p)
     brier = float(np.mean((p - true) ** 2)) if made else math.nan
     total_std = math.sqrt(float(spread.sum()))
+    expected = float(spread.mean()) if made else math.nan
     return Reliability(
-        drives=len(calls),
-        failed=len(calls) - len(made),
-        brier=brier,
-        brier_expected=float(spread.mean()) if made else math.nan,
+        len(calls), len(calls) - len(made), brier, expected,
         brier_std=math.sqrt(float((spread * (1.0 - 2.0 * p) ** 2).sum())) / n,
         excess=float((true - p).sum()) / total_std if total_std > 0.0 else math.nan,
-        go=int(go.sum()),
-        wrong_go=int((go & (true < 0.5)).sum()),
-        wrong_go_expected=float((1.0 - p)[go].sum()),
+        go=int(go.sum()), wrong_go=int((go & (true < 0.5)).sum()), wrong_go_expected=float((1.0 - p)[go].sum()),
         bins=tuple(_bin(i, p, true) for i in range(BINS)),
-    )
+    )  # fmt: skip
 
 
 def _bin(i: int, p: Array, true: Array) -> Bin:

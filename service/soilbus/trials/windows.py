@@ -43,20 +43,9 @@ def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:
 
 
 def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np.float64], fresh: bool) -> WindowTask:
-    """A window task without missing inputs.
+    """The task of a window that ends at `end` [s], without missing inputs.
 
-    Parameters
-    ----------
-    window
-        The data.
-    end
-        End of the window [s].
-    config
-        Window and hop.
-    torque_limit
-        (W,) [N m]; nan where unknown.
-    fresh
-        Whether nothing of the window before is carried over.
+    torque_limit (W,) [N m] is nan where it is unknown; `fresh` carries nothing over from the window before.
     """
     return WindowTask(
         index=0 if fresh else round((end - config.estimator.window) / config.estimator.hop),

@@ -8,8 +8,7 @@ Times are the least of several rounds, taken in turn, so that a busy machine slo
 from __future__ import annotations
 
 import platform
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,28 +18,29 @@ import numpy as np
 
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
+from soilbus.report.progress import phases
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.trials.bench import decode, growth, paper, replay, service, window
+from soilbus.trials.bench import growth, on_log, paper, window
 from soilbus.trials.bench.figure import Figure
 
 RECORDING_TIME = 120.0
 """Length of the simulated log [s]."""
 THREADS = 1
-"""Threads of linear algebra."""
+"""Threads of linear algebra, as in the service's unit: two would wait for each other, and both would be counted."""
 
 Measurement = Callable[[Path], Mapping[str, Figure]]
 """Figures by name, from a recorded log that they may use."""
 
 MEASUREMENTS: tuple[Measurement, ...] = (
-    lambda log: {"decode_speedup": decode.decode_speedup(log)},
-    lambda log: replay.replay_factors(log, RECORDING_TIME),
+    lambda log: {"decode_speedup": on_log.decode_speedup(log)},
+    lambda log: on_log.replay_factors(log, RECORDING_TIME),
     lambda _: {"paper_solve_speedup": paper.paper_solve_speedup()},
     lambda _: {"window_solve_speedup": window.window_solve_speedup()},
-    service.window_times,
+    on_log.window_times,
     lambda _: growth.exponents(),
 )
 
@@ -59,10 +59,6 @@ def run_bench() -> dict[str, Any]:
     AssertionError
         Ours and a peer come to different results.
 
-    Notes
-    -----
-    Linear algebra runs with one thread, as the service's unit sets it: two threads would wait for each other, and both
-    would be counted.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -81,8 +77,11 @@ def _figures() -> dict[str, Figure]:
         write_log(
             frames(simulate(config, excited("loam", RECORDING_TIME), seed=1), config, load_databases(config)), log
         )
-        for measure in _with_progress(MEASUREMENTS):
-            figures |= measure(log)
+        with phases("bench") as say:
+            for i, measure in enumerate(MEASUREMENTS, 1):
+                if say is not None:
+                    say(f"{i} of {len(MEASUREMENTS)}")
+                figures |= measure(log)
     return figures
 
 
@@ -101,14 +100,3 @@ def bench_report(results: Mapping[str, Any]) -> str:
     rows = [(name, f"{f.value:.{f.digits}f}", f.aim, f.peer, f.what) for name, f in figures.items()]
     extra = [line for f in figures.values() for line in ("", *f.more) if f.more]
     return table(("figure", "value", "target", "beside", "what"), rows) + "".join(f"{line}\n" for line in extra)
-
-
-def _with_progress(measurements: Iterable[Measurement]) -> Iterator[Measurement]:
-    """The same, with a progress bar on a terminal."""
-    if not sys.stderr.isatty():
-        yield from measurements
-        return
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(list(measurements), "bench", console=Console(stderr=True), transient=True)

@@ -10,8 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from soilbus.can.channels import Column
-from soilbus.config.model import Config, Wheel
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
@@ -23,7 +21,7 @@ from soilbus.terra.wheel import Soil
 from soilbus.trials.bench.figure import Figure, in_turn
 from soilbus.trials.windows import fit_from_soil, observed
 
-WHEELS = (1, 2, 4, 8)
+WHEELS = (2, 4)
 WINDOW_LENGTHS = (5.0, 10.0, 20.0, 40.0)
 """Lengths of the windows [s]."""
 ROUNDS = 6
@@ -68,35 +66,9 @@ def _fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
 
 
 def problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
-    """Windows of all lengths of a tractor with this number of wheels, half of them on each axle; one: a test rig."""
-    config = _configuration(max(wheels, 2))
-    recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
-    channels = dict(recording.channels)
-    if wheels == 1:
-        config = config.model_copy(update={"wheel": config.wheel[:1], "vehicle": None})
-        pull = recording.truth[f"drawbar_pull.{config.wheel[0].name}"]
-        noise = config.noise.draft.absolute * np.random.default_rng(1).standard_normal(len(pull))
-        channels["draft"] = Column(recording.truth["t"], pull + noise)
+    """Windows of all lengths of the reference tractor with this number of wheels, half of them on each axle."""
+    config = reference_configuration()
+    config = config.model_copy(update={"wheel": config.wheel[:: len(config.wheel) // wheels]})
+    channels = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1).channels
     for length in WINDOW_LENGTHS:
         yield observed(config, channels, length), prior_of(config)
-
-
-def _configuration(wheels: int) -> Config:
-    """The reference tractor with more or fewer wheels, and as much heavier or lighter."""
-    config = reference_configuration()
-    axles = [next(w for w in config.wheel if w.axle == axle) for axle in ("front", "rear")]
-    fitted = [_own_sensors(w, f"{w.name}{i}") for w in axles for i in range(wheels // 2)]
-    if config.vehicle is None:
-        raise AssertionError("the reference tractor is a vehicle")
-    vehicle = config.vehicle.model_copy(update={"mass": config.vehicle.mass * wheels / len(config.wheel)})
-    return config.model_copy(update={"wheel": fitted, "vehicle": vehicle})
-
-
-def _own_sensors(wheel: Wheel, name: str) -> Wheel:
-    """The wheel under another name, with sensors of its own."""
-    signals = {
-        role: mapped.model_copy(update={"signal": f"{mapped.signal}{name}"})
-        for role in ("torque", "speed", "load")
-        if (mapped := getattr(wheel, role)) is not None
-    }
-    return wheel.model_copy(update={"name": name, **signals})

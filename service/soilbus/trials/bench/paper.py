@@ -90,20 +90,14 @@ def balance(point: OperatingPoint, measured: Forces) -> Callable[[Any], list[flo
         def shear_rear(angle: float) -> float:
             return (c + rear(angle) * tan) * share(angle)
 
-        A1 = quad(lambda a: front(a) * cos(a), middle, theta1)[0]
-        A2 = quad(lambda a: rear(a) * cos(a), 0.0, middle)[0]
-        A3 = quad(lambda a: front(a) * sin(a), middle, theta1)[0]
-        A4 = quad(lambda a: rear(a) * sin(a), 0.0, middle)[0]
-        B1 = quad(lambda a: shear_front(a) * sin(a), middle, theta1)[0]
-        B2 = quad(lambda a: shear_rear(a) * sin(a), 0.0, middle)[0]
-        B3 = quad(lambda a: shear_front(a) * cos(a), middle, theta1)[0]
-        B4 = quad(lambda a: shear_rear(a) * cos(a), 0.0, middle)[0]
-        C1 = quad(shear_front, middle, theta1)[0]
-        C2 = quad(shear_rear, 0.0, middle)[0]
-        return [
-            area * (A1 + A2 + B1 + B2) - measured.W,
-            area * (B3 + B4 - A3 - A4) - measured.DP,
-            area * r * (C1 + C2) - measured.T,
-        ]
+        def integral(before: Callable[[float], float], after: Callable[[float], float]) -> float:
+            return float(quad(before, middle, theta1)[0] + quad(after, 0.0, middle)[0])
+
+        load = integral(lambda a: front(a) * cos(a), lambda a: rear(a) * cos(a))
+        load += integral(lambda a: shear_front(a) * sin(a), lambda a: shear_rear(a) * sin(a))
+        pull = integral(lambda a: shear_front(a) * cos(a), lambda a: shear_rear(a) * cos(a))
+        pull -= integral(lambda a: front(a) * sin(a), lambda a: rear(a) * sin(a))
+        turn = integral(shear_front, shear_rear)
+        return [area * load - measured.W, area * pull - measured.DP, area * r * turn - measured.T]
 
     return left
