@@ -25,7 +25,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from tests.lab.statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
+from statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)

@@ -23,12 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.diagnosis.diagnose import of_vehicle
-from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.fleet import by_name, diagnose_type, named
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.vehicle_type import own_probabilities
-from soilbus.diagnosis.verdict import probabilities, temperature
 from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.report.table import table
@@ -64,7 +61,7 @@ FAULTS = (
 )
 """Faults of vehicles, between barely visible and as great as they get."""
 SHARED = (Fault("drivetrain_loss:constant", 60.0), Fault("drivetrain_loss:efficiency", 0.07))
-"""Effects of a type, unless another is asked for."""
+"""Effects of a type."""
 
 
 @dataclass(frozen=True)
@@ -143,14 +140,6 @@ def is_true(one: Named, of: Fleet) -> bool:
     return one.vehicle in of.faults and one.effect == of.faults[one.vehicle].effect
 
 
-def of_type(name: str) -> tuple[Fault, ...]:
-    """An effect of the catalogue as one of a type: in each of its forms, of medium size.  ValueError if it has none."""
-    forms = [form for form in FORMS if form.effect == name]
-    if not forms:
-        raise ValueError(f"no form of {name}; known: {', '.join(sorted({form.effect for form in FORMS}))}")
-    return tuple(Fault(form.title, form.size("medium", with_sinkage=True)) for form in forms)
-
-
 def faults_of(seed: int) -> dict[int, Fault]:
     """Three vehicles with faults by turns."""
     rng = np.random.default_rng([seed, 7])
@@ -158,71 +147,15 @@ def faults_of(seed: int) -> dict[int, Fault]:
     return dict(zip(rng.choice(VEHICLES, 3, replace=False).tolist(), kinds, strict=True))
 
 
-class Rivalry(NamedTuple):
-    """What the logs that have a fault, which is all that is hidden in them, show of it.
-
-    excess is that of the squared residuals without any effect; fall and rival_fall are of -2 log evidence, by the
-    effect and by the best other one; probability and untempered are of its name, with T as it is and with T = 1.
-    """
-
-    excess: float
-    fall: float
-    rival: str
-    rival_fall: float
-    probability: float
-    untempered: float
-
-
-def rivalry(seed: int, vehicle: int, fault: Fault) -> Rivalry:
-    """One vehicle's fault beside each effect of the catalogue in its place."""
-    config = reference_configuration()
-    prior = prior_of(config)
-    records = [_record(seed, vehicle, log, fault) for log in range(fault.first, LOGS)]
-    base = fit_model(records, prior, ())
-    assert base is not None
-    falls: dict[str, float] = {}
-    for effect in possible_effects(config):
-        if effect.base_law in (None, records[0].training.model.shear_law):
-            one = of_vehicle(effect, records)
-            fitted = fit_model(records, prior, [one], base.as_starts([one]))
-            if fitted is not None:
-                falls[one.name] = base.neg2_log_evidence - fitted.neg2_log_evidence
-    name = fault.effect
-    rival = max(falls.keys() - {name}, key=lambda other: falls[other])
-    chances = [probabilities(falls, divisor)[name] for divisor in (temperature(base.excess), 1.0)]
-    return Rivalry(base.excess, falls[name], rival, falls[rival], *chances)
-
-
-def print_rivals(seeds: Sequence[int]) -> None:
-    """A row for each fault of these fleets."""
-    rows = []
-    for seed in seeds:
-        for vehicle, fault in sorted(faults_of(seed).items()):
-            one = rivalry(seed, vehicle, fault)
-            falls = f"{one.fall:.1f}", f"{one.rival} {one.rival_fall:.1f}"
-            chances = f"{one.probability:.2f}", f"{one.untempered:.2f}"
-            rows.append((str(seed), str(vehicle), fault.form, f"{one.excess:.0f}", *falls, *chances))
-    print(table(("seed", "vehicle", "fault", "excess", "fall", "best other effect", "P", "P at T = 1"), rows))
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line for each fleet and the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.lab.fleet", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--seed", type=int, default=1, help="of the first fleet (1)")
     parser.add_argument("--fleets", type=int, default=2, help="fleets of each kind (2)")
-    parser.add_argument("--type-effect", metavar="NAME", help="of the type, in its forms by turns (drivetrain_loss)")
     parser.add_argument("--only-shared", action="store_true", help="no fleets without an effect of the type")
-    parser.add_argument("--rivals", action="store_true", help="what the logs with each fault can show of it at all")
     chosen = parser.parse_args(arguments)
-    if chosen.rivals:
-        print_rivals(range(chosen.seed, chosen.seed + chosen.fleets))
-        return 0
-    try:
-        shared = of_type(chosen.type_effect) if chosen.type_effect else SHARED
-    except ValueError as error:
-        parser.error(str(error))
     rows = []
-    for effects in (shared,) if chosen.only_shared else (shared, ()):
+    for effects in (SHARED,) if chosen.only_shared else (SHARED, ()):
         faults = found = since = types = types_found = sound = sound_named = true = given = 0
         for seed in range(chosen.seed, chosen.seed + chosen.fleets):
             of = fleet(seed, faults_of(seed), effects[seed % len(effects)] if effects else None)

@@ -26,7 +26,7 @@ from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil
 from soilbus.trials.boggings import largest_draft
 from soilbus.trials.windows import torque_limits
-from tests.lab.statics import WEIGHT, brute_with_rolling, wheel
+from statics import WEIGHT, brute_with_rolling, wheel
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""

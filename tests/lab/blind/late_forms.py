@@ -35,14 +35,7 @@ def _averaged(draft: Array, around: Surroundings, values: Sizes) -> Array:
 
 
 FORMS = (
-    Form(
-        "channel_lag",
-        "receiver",
-        "speed of a receiver of positions, 0.1 to 0.3 s late",
-        "s",
-        (0.04, 0.04),
-        0.4,
-        _from_a_receiver,
-    ),
+    Form("channel_lag", "receiver", "speed of a receiver of positions, 0.1 to 0.3 s late", "s", (0.04, 0.04), 0.4,
+         _from_a_receiver),
     Form("channel_lag", "averaged_draft", "mean of a time before", "s", (0.06, 0.06), 0.8, by_hooks(draft=_averaged)),
-)
+)  # fmt: skip

@@ -116,47 +116,20 @@ def _nodding_radar(name: str, t: Array, recording: Recording, size: float) -> Ar
 
 FORMS = (
     Form("", "torque_ripple", "locked to the wheel angle", "1", (0.0012, 0.0012), 0.08, by_hooks(torque=_ripple)),
-    Form(
-        "",
-        "draft_leak",
-        "draft in the wheel load cells",
-        "1",
-        (0.0055, 0.0055),
-        0.2,
-        by_hooks(load=_draft_leak),
-        imitable=True,
-    ),
+    Form("", "draft_leak", "draft in the wheel load cells", "1", (0.0055, 0.0055), 0.2, by_hooks(load=_draft_leak),
+         imitable=True),
     Form("", "tooth_error", "once a turn of each wheel", "1", (0.001, 0.001), 0.02, _channels(_tooth)),
-    Form(
-        "", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated), imitable=True
-    ),
-    Form(
-        "", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking), imitable=True
-    ),
+    Form("", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated),
+         imitable=True),
+    Form("", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking),
+         imitable=True),
     Form("", "row_spacing", "soil changes every 0.75 m", "1", (0.003, 0.003), 0.4, by_hooks(wheel=_rows)),
-    Form(
-        "",
-        "cross_talk",
-        "torques of an axle mixed",
-        "1",
-        (0.02, 0.02),
-        0.5,
-        by_hooks(torque=_cross_talk),
-    ),
-    Form(
-        "", "warming_torque", "span settles", "1", (0.0033, 0.0033), 0.08, by_hooks(torque=_warm_torque), imitable=True
-    ),
+    Form("", "cross_talk", "torques of an axle mixed", "1", (0.02, 0.02), 0.5, by_hooks(torque=_cross_talk)),
+    Form("", "warming_torque", "span settles", "1", (0.0033, 0.0033), 0.08, by_hooks(torque=_warm_torque),
+         imitable=True),
     Form("", "bouncing", "load cells at 1.3 Hz", "N", (5.5, 5.5), 600.0, by_hooks(load=_bouncing)),
     Form("", "nodding_radar", "ground speed every 2 s", "1", (0.0017, 0.0017), 0.04, _channels(_nodding_radar)),
     Form("", "hitch_sway", "draft every 2.5 s", "N", (20.0, 20.0), 600.0, by_hooks(draft=_swaying)),
-    Form(
-        "",
-        "stuck_gauge",
-        "hysteresis of the torque cells",
-        "N m",
-        (3.0, 3.0),
-        60.0,
-        by_hooks(torque=_stuck_gauge),
-        imitable=True,
-    ),
-)
+    Form("", "stuck_gauge", "hysteresis of the torque cells", "N m", (3.0, 3.0), 60.0, by_hooks(torque=_stuck_gauge),
+         imitable=True),
+)  # fmt: skip
