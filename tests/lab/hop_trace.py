@@ -49,23 +49,9 @@ class HopTrace(NamedTuple):
 
 
 def hop_trace(warm_hops: int = WARM_HOPS, watched: bool = False) -> HopTrace:
-    """Trace one hop of the reference tractor's drive.
+    """Counts of the hop after `warm_hops` of the reference tractor's drive, of its moments' watch too if `watched`.
 
-    Parameters
-    ----------
-    warm_hops
-        Windows solved, one hop apart, before the one that is traced.
-    watched
-        Whether the watch of the hop's moments counts, too.
-
-    Returns
-    -------
-    The counts of the traced hop.
-
-    Raises
-    ------
-    RuntimeError
-        The drive is too short for that many windows.
+    Raises RuntimeError where the drive is too short for that many windows.
     """
     config = reference_configuration()
     settings = config.estimator

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -12,15 +11,14 @@ from scipy.integrate import quad
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
-from tests.lab.peers import finite_differences, kalman, learned, linear, newton_raphson, ours
-from tests.lab.peers.command import main
+from tests.lab.peers import finite_differences, kalman, linear, newton_raphson, ours
+from tests.lab.peers.__main__ import main
 from tests.lab.peers.compare import compared, ours_is_ahead, tables, verdict
 from tests.lab.peers.roster import OURS, Entry, roster
 from tests.lab.peers.scores import Duel, Score, duel, truth
 from tests.lab.peers.windows import assumed_of, configured_prior, simulated_case
 
 NAMES = ("loam", "wet_clay", "dry_sand")
-TRAINING = 60
 ALL_BUT_PHI_AND_N = ("k_c", "k_phi", "c", "K")
 
 
@@ -36,14 +34,9 @@ def quiet():
 
 
 @pytest.fixture(scope="module")
-def regressor():
-    return learned.trained(TRAINING)
-
-
-@pytest.fixture(scope="module")
-def entries(regressor):
+def entries():
     """The roster without those that have tests of their own: least_squares (slow, our optimum)."""
-    return [entry for entry in roster(regressor) if entry.method is not finite_differences.estimate]
+    return [entry for entry in roster() if entry.method is not finite_differences.estimate]
 
 
 @pytest.fixture(scope="module")
@@ -98,18 +91,6 @@ def test_the_filter_is_robust_to_a_wild_reading():
         assert after[name].value == pytest.approx(before[name].value, rel=0.01)
 
 
-def test_the_regressor_learns(regressor):
-    # Windows of its own kind that it has not seen; the prior's median is what it would say untrained.
-    cases = [learned.training_case(np.random.default_rng([learned.SEED, TRAINING + i])) for i in range(15)]
-    said = np.log([[regressor.estimate(c)[q].value for q in learned.TARGETS] for c in cases])
-    true = np.log([learned.targets(c.soil) for c in cases])
-    rms = dict(zip(learned.TARGETS, np.sqrt(np.mean((said - true) ** 2, axis=0)), strict=True))
-    spread = dict(zip(learned.TARGETS, true.std(axis=0), strict=True))
-    assert rms["bearing"] < 0.25 * spread["bearing"]
-    assert rms["phi"] < 0.5 * spread["phi"]
-    assert rms["n"] < 0.75 * spread["n"]
-
-
 def test_least_squares_finds_our_optimum_and_our_covariance():
     # A check of our derivatives, weights and steps as much as of the peer.
     whole = simulated_case(SOILS["wet_clay"], 7)
@@ -146,7 +127,7 @@ def test_ours_is_closer_than_every_peer_on_noisy_windows(scores, entries):
         for quantity in scores["loam"][peer].quantities:
             assert rms(scores, mine[peer.exact], quantity) < rms(scores, peer, quantity), (peer, quantity)
             compared_ += 1
-    assert compared_ == 2 * 2 + 2 * 3 + 2 * 3 + 5
+    assert compared_ == 2 * 2 + 2 * 3 + 2 * 3
 
 
 def test_ours_never_fails_and_covers_the_truth(scores, entries):
@@ -211,9 +192,3 @@ def test_the_command_says_what_is_wrong_with_its_options(capsys):
         main(["--windows", "0"])
     assert end.value.code == 2
     assert "at least 1 window" in capsys.readouterr().err
-
-
-def test_without_scikit_learn_one_line_says_which_extra_is_missing(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "sklearn.kernel_ridge", None)
-    assert main(["--windows", "1", "--train", "20"]) == 1
-    assert capsys.readouterr().err == "the learned regressor needs the extra soilbus[peers]\n"

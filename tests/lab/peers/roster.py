@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tests.lab.peers import finite_differences, kalman, learned, linear, newton_raphson, ours
+from tests.lab.peers import finite_differences, kalman, linear, newton_raphson, ours
 from tests.lab.peers.windows import Method
 
 __all__ = [
@@ -35,7 +35,7 @@ class Entry:
         return self.note or (", ".join(self.exact) + " exactly" if self.exact else "")
 
 
-def roster(regressor: learned.Regressor) -> list[Entry]:
+def roster() -> list[Entry]:
     """Ours and the peers: peers that hold parameters fixed twice, given them exactly and to a quarter.
 
     Ours stands once for each set that a peer is given exactly.
@@ -52,7 +52,6 @@ def roster(regressor: learned.Regressor) -> list[Entry]:
         Entry("Newton-Raphson (Hutangkabodee)", newton_raphson.estimate, note="c, n to 25 %"),
         Entry("Kalman filter (Li)", kalman.estimate, rest),
         Entry("Kalman filter (Li)", kalman.estimate, note=", ".join(rest) + " to 25 %"),
-        Entry("kernel ridge (Xue)", regressor.estimate, note="c, K to 25 %"),
     ]
 
 
@@ -63,5 +62,4 @@ What each assumes:
   linear                  triangular stresses; sinkage exact
   Newton-Raphson          Bekker's law with n given, sinkage and slip exact; a modulus for each tyre width
   Kalman filter           all but phi and n given; the sensors' noise, no gain errors
-  kernel ridge            soils come from the prior; trained on windows of a light generator, tested on the simulator's
 """

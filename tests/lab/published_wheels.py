@@ -1,6 +1,6 @@
-"""`python -m tests.lab.published_wheels POINTS`: what the model misses on published single-wheel points.
+"""What the model misses on published single-wheel points.
 
-POINTS is shared/field/single-wheel-published.csv: five or six rows a wheel, traced
+Points are shared/field/single-wheel-published.csv: five or six rows a wheel, traced
 by eye from figures.  So each line holds only for these few rows and the errors assumed in
 rigs/*.toml.  Where the soil is from the other wheel, that wheel's posterior of soil and effects is
 the prior: a missing effect is then a difference between the two wheels.
@@ -8,10 +8,7 @@ the prior: a missing effect is then a difference between the two wheels.
 
 from __future__ import annotations
 
-import argparse
-import math
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -23,10 +20,8 @@ from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.verdict import gap_limit
 from soilbus.estimation.assembly import prior_of
 from soilbus.offline.tables import candidates, recordings_of_tables
-from soilbus.report.table import table
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 RIGS = Path(__file__).with_name("rigs")
@@ -126,90 +121,3 @@ def strain(fitted: FittedModel) -> float:
     free = np.flatnonzero(np.diag(before.covariance)[:6] > 0.0)
     off = np.log(after.soil[free] / before.soil[free])
     return float(off @ np.linalg.solve(before.covariance[np.ix_(free, free)], off)) / len(free)
-
-
-def tabulated(found: Sequence[Case]) -> str:
-    """A row for each case."""
-    head = (
-        "rig",
-        "wheel",
-        "soil from",
-        "errors",
-        "gap",
-        "noise below",
-        "soil strained",
-        "verdict",
-        "effects",
-        "beside",
-    )
-    return table(head, [_row(case) for case in found])
-
-
-def _row(case: Case) -> tuple[str, ...]:
-    found, base = case.found, case.found.base
-    had = "".join(f"{name} known; " for name in base.names)
-    added = ", ".join(f"{a.effect.name} {a.falls[a.effect.name]:.0f} (p {a.probability:.2f})" for a in found.additions)
-    first = found.additions[0] if found.additions else None
-    falls = sorted(first.falls.items(), key=lambda item: -item[1]) if first else []
-    return (
-        case.rig,
-        case.wheel,
-        case.soil,
-        f"x{case.errors:g}",
-        f"{base.held_out_chi2:.1f} -> {found.completed.held_out_chi2:.1f}",
-        f"{gap_limit(base.checked_rows):.1f}",
-        f"{strain(base):.1f} -> {strain(found.completed):.1f}",
-        str(found.verdict),
-        (had + (added or "none added")).strip(),
-        ", ".join(f"{name} {fall:.0f}" for name, fall in falls if first and name != first.effect.name)[:60] or "-",
-    )
-
-
-def soils(found: Sequence[Case]) -> str:
-    """Soil and effects' parameters of each case under the completed model."""
-    rows = []
-    for case in found:
-        fit = case.found.completed.fits[-1]
-        values = fit.posterior.parameters()
-        effects = case.found.completed.parameters()
-        reported = "; ".join(
-            f"{name} " + ", ".join(f"{p} {e.value:.3g} ± {e.std:.2g}" for p, e in of.items())
-            for name, of in effects.items()
-        )
-        phi, c, K = values["phi"], values["c"], values["K"]
-        rows.append(
-            (
-                case.rig,
-                case.wheel,
-                case.soil,
-                f"x{case.errors:g}",
-                f"{values['n'].value:.2f} ± {values['n'].std:.2f}",
-                f"{math.degrees(phi.value):.1f} ± {math.degrees(phi.std):.1f}",
-                f"{c.value / 1e3:.2f} ± {c.std / 1e3:.2f}",
-                f"{1e3 * K.value:.1f} ± {1e3 * K.std:.1f}",
-                reported or "-",
-            )
-        )
-    return table(("rig", "wheel", "soil from", "errors", "n", "phi, deg", "c, kPa", "K, mm", "effects"), rows)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print all cases; 1 where there are no points."""
-    parser = argparse.ArgumentParser(prog="python -m tests.lab.published_wheels", description=__doc__)
-    parser.add_argument("points", type=Path, help="single-wheel-published.csv")
-    points = parser.parse_args(arguments).points
-    if not points.exists():
-        print(f"no {points}", file=sys.stderr)
-        return 1
-    found = [case for errors in ERRORS for case in cases(errors, points)]
-    print(tabulated(found))
-    print("effects: fall of -2 log evidence in the round that added them; beside: others in the first round")
-    print("soil strained: chi-square per parameter of the soil's posterior mean under its prior\n")
-    print(soils(found))
-    print("\nDing's lugged wheel on the smooth wheel's soil: fall of -2 log evidence (strain left of the soil)")
-    for errors in (*ERRORS, 3.0):
-        reported = ", ".join(
-            f"{n} {b.fall:.0f} ({b.strain:.1f})" for n, b in lugs_beside_a_shifted_peak(errors, points).items()
-        )
-        print(f"  errors x{errors:g}: {reported}")
-    return 0
