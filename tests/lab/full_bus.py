@@ -32,14 +32,12 @@ import can
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.can.bus import RECEIVE_BUFFER, BusError, open_bus
+from soilbus.can.bus import BusError, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.j1939 import pgn_of
 from soilbus.can.publish import Frame
 from soilbus.can.wire import wire_of
-from soilbus.daemon.bus_health import RECEIVED_MODULUS
-from soilbus.pipeline.intake import EDGE_LEAD, Intake
-from soilbus.pipeline.outputs import WINDOW_MODULUS
+from soilbus.pipeline.intake import Intake
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
@@ -49,6 +47,12 @@ from soilbus.trials.bench.figure import Figure
 
 MIN_SECONDS = 15.0
 """Least time [s] on a full bus: a window and its result."""
+RECEIVED_MODULUS, WINDOW_MODULUS = 4016, 251
+"""Values of the daemon's 12-bit count of received frames and of its 8-bit window number (dbc/soilbus.dbc)."""
+EDGE_LEAD = 0.005
+"""Time [s] before the first sample at which the daemon's bins begin."""
+RECEIVE_BUFFER = 4 << 20
+"""Bytes of a kernel's buffer that hold seconds of frames."""
 FULL_BUS_RATE = 7350.0
 """Frames a second of 8 bytes with 29-bit identifiers that 1 Mbit/s carries, at 136 bits each with their stuff bits."""
 MAPPED_SHARE = 0.1

@@ -12,7 +12,7 @@ from soilbus.arrays import Array
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched, with_loss
 from soilbus.decision.options import WATCH, WatchOptions
-from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, bins_of_a_moment, motions, slope_felt
+from soilbus.decision.traction_loss import TractionLoss, bins_of_a_moment, motions, slope_felt
 from soilbus.decision.traction_loss import observed as loss_after
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
@@ -56,7 +56,7 @@ def observed(task: Task) -> Observation:
         if result.curve is not None:
             curves.append((due, result.curve))
     seen = completed(forward(store.window(0.0, drive.end)), rig)
-    losses, loss, bins, ends = [], NO_LOSS, bins_of_a_moment(settings.bin), np.arange(len(seen.t))
+    losses, loss, bins, ends = [], TractionLoss(), bins_of_a_moment(settings.bin), np.arange(len(seen.t))
     for motion in motions(seen, rig, limit, config.traversability, ends, bins):
         loss = loss_after(loss, motion, config)
         losses.append(loss)
@@ -71,7 +71,7 @@ def watch(observation: Observation, options: WatchOptions = WATCH) -> tuple[Arra
     """Times [s] (N,) of the looks, and whether each warned."""
     state, curve, curves, out = Watch(), None, iter(observation.curves), []
     due = next(curves, None)
-    losses = observation.losses or [NO_LOSS] * len(observation.moments)
+    losses = observation.losses or [TractionLoss()] * len(observation.moments)
     for moment, loss in zip(observation.moments, losses, strict=True):
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)

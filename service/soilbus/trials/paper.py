@@ -23,19 +23,9 @@ from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel import EXACT_NODES
 
 __all__ = [
-    "EXACT",
-    "EXACT_EXPONENTIAL",
-    "SIMPSON",
-    "Equations",
-    "Forces",
-    "OperatingPoint",
-    "Solution",
-    "Three",
-    "Unknowns",
-    "WheelEquations",
-    "entry_angle",
-    "moduli_from_two_widths",
-]
+    "EXACT", "EXACT_EXPONENTIAL", "SIMPSON", "Equations", "Forces", "OperatingPoint", "Solution", "Three",
+    "Unknowns", "WheelEquations", "entry_angle", "moduli_from_two_widths",
+]  # fmt: skip
 
 Three = tuple[float, float, float]
 

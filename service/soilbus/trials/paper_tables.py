@@ -14,20 +14,9 @@ from soilbus.terra.wheel import Soil
 from soilbus.trials.paper import OperatingPoint, Unknowns
 
 __all__ = [
-    "RUNS",
-    "SANDY_LOAM",
-    "SINKAGE",
-    "SLIP",
-    "START_ERRORS",
-    "TRACTOR_2",
-    "TRIALS",
-    "WET_CLAY",
-    "Run",
-    "Trial",
-    "as_print",
-    "errors_in_percent",
-    "from_print",
-]
+    "RUNS", "SANDY_LOAM", "SINKAGE", "SLIP", "START_ERRORS", "TRACTOR_2", "TRIALS", "WET_CLAY", "Run", "Trial",
+    "as_print", "errors_in_percent", "from_print",
+]  # fmt: skip
 
 SLIP = 0.2
 """Section 4.2."""
