@@ -34,7 +34,7 @@ _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29  # flags of can_id
 _IDENTIFIER = (1 << 29) - 1
 _HEAD = struct.Struct("=IB3x")  # can_id, length; the same in struct can_frame and canfd_frame
 _FRAME = struct.Struct("=IB3x8s")
-_LONGEST = 72
+_LONGEST = 72  # of struct canfd_frame
 _STAMP = struct.Struct("@ll")
 _COUNT = struct.Struct("@I")
 _ANCILLARY = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(_COUNT.size)
@@ -50,6 +50,7 @@ class Received(NamedTuple):
     is_error_frame: bool
     data: bytes
     is_rx: bool = True
+    is_fd: bool = False
 
 
 class MessageBus(Protocol):
@@ -112,6 +113,7 @@ class SocketWire:
         own.setblocking(False)
         own.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALL_SEND_BUFFER)
+        own.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)  # else one under our identifier is not heard
         self._poll = select.poll()
         self._poll.register(own, select.POLLIN)
 
@@ -143,7 +145,8 @@ class SocketWire:
             return None
         word, length = _HEAD.unpack_from(raw)
         return Received(
-            t, word & _IDENTIFIER, word & _EXTENDED != 0, word & _REMOTE != 0, word & _ERROR != 0, raw[8 : 8 + length]
+            t, word & _IDENTIFIER, word & _EXTENDED != 0, word & _REMOTE != 0, word & _ERROR != 0,
+            raw[8 : 8 + length], is_fd=len(raw) == _LONGEST,
         )  # fmt: skip
 
     def stamping_time(self) -> float:
