@@ -324,6 +324,32 @@ def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
     assert dashboard.value("Traversability", "State") is None
 
 
+def test_a_frame_of_can_fd_is_never_ours(setup):
+    publisher, dashboard, _ = setup
+    frame = message(publisher.frame("Traversability", {"State": "no_go"}))
+    frame.is_fd = True
+    dashboard.receive(frame)
+    assert (dashboard.bad_frames, dashboard.value("Traversability", "State")) == (1, None)
+
+
+def test_a_second_sender_is_named_and_nothing_of_its_message_is_shown(desk):
+    desk.send_all(DemandForecast={"Warning": "none"})
+    assert desk.dashboard.verdict().word == "GO"
+    desk.send("WheelSlip", SlipWheel1=0.1)
+    twin = Publisher(output_database(CONFIG))
+    for _ in range(2):
+        frame = twin.frame("WheelSlip", {"SlipWheel1": 0.3})
+    desk.known.receive(message(frame))
+    assert desk.dashboard.verdict()[:3] == (
+        "UNKNOWN", "UNKNOWN: another node sends our frames", "Remove the second soilbus"
+    )  # fmt: skip
+    assert desk.known.value("WheelSlip", "SlipWheel1") is None
+    assert not desk.known.is_valid("TractionLimits")
+    desk.clock.now += 3.0
+    desk.send_all(DemandForecast={"Warning": "none"})
+    assert desk.dashboard.verdict().word == "GO"
+
+
 def test_a_stuck_counter_keeps_nothing_fresh(setup):
     publisher, dashboard, clock = setup
     stuck, after = (message(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))

@@ -12,6 +12,7 @@ import select
 import socket
 import struct
 import time
+from contextlib import suppress
 from typing import NamedTuple, Protocol
 
 import can
@@ -113,7 +114,8 @@ class SocketWire:
         own.setblocking(False)
         own.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALL_SEND_BUFFER)
-        own.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)  # else one under our identifier is not heard
+        with suppress(OSError):  # where the socket knows no CAN FD, none comes; else one under our id would be hidden
+            own.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         self._poll = select.poll()
         self._poll.register(own, select.POLLIN)
 
