@@ -204,6 +204,8 @@ def test_every_reason_of_a_refusal_has_its_code():
 
     of_window = load("soilbus").get_message_by_name("WindowQuality").get_signal_by_name("RejectedReason")
     names = [str(of_window.choices[code]) for code in range(int(of_window.maximum) + 1)]
-    of_reason = {Reason.NOT_AVAILABLE: "no_value", Reason.ERROR: "sensor_error"}
-    assert names == ["none", *(of_reason.get(reason, str(reason)) for reason in Reason), "outlier"]
+    of_reason = {
+        Reason.NOT_AVAILABLE: "no_value", Reason.ERROR: "sensor_error", Reason.SECOND_SENDER: "bad_counter"
+    }  # fmt: skip
+    assert names == ["none", *dict.fromkeys(of_reason.get(reason, str(reason)) for reason in Reason), "outlier"]
     assert set(of_window.choices) == {*range(len(names)), 254, 255}

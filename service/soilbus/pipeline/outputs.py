@@ -68,8 +68,8 @@ PARAMETER_FRAMES = {
     "K": ("SoilShearModulus", 1e-3),
 }
 
-REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error"}
-"""Reasons of refusal whose names mean in a value table that the signal itself has no value."""
+REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error", "second_sender": "bad_counter"}
+"""Names in the value table of reasons of refusal: two mean there that the signal itself has no value, one is newer."""
 
 HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
