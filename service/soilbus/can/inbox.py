@@ -72,11 +72,11 @@ class Inbox:
     last_counter: int = -1
     last_data: bytes = b""
     counter_errors: int = 0
-    """Frames whose counter did not go on by one, less those whose did; 0 to COUNTER_ERRORS."""
+    """Frames whose counter did not go on by one, less those whose counter did; from 0 to COUNTER_ERRORS."""
     is_untrusted: bool = False
-    """Whether the errors reached COUNTER_ERRORS, and not 0 since."""
+    """Whether the errors have reached COUNTER_ERRORS and are not back at 0 yet."""
     untrusted: Mask | None = None
-    """Those of the last batch that came while the message was not trusted."""
+    """Which frames of the last batch came while the message was not trusted."""
     last_frame: tuple[float, int, bytes] = _NO_FRAME
     missed: int = 0
     """Frames that the counters of a checked message skip: lost, or refused for their checksum."""
@@ -160,11 +160,8 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
     follows = np.diff(batch.ids, prepend=inbox.last_id) == 0
     moved: Mask = (step != 0) | ~follows
     untrusted = _untrusted(inbox, batch, step, follows)
-    inbox.last_counter, inbox.last_id, inbox.last_data = (
-        int(counter[-1]),
-        int(batch.ids[-1]),
-        batch.payload[-1].tobytes(),
-    )
+    inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
+    inbox.last_data = batch.payload[-1].tobytes()
     inbox.missed += int(np.maximum(step - 1, 0)[follows if untrusted is None else follows & ~untrusted].sum())
     if untrusted is not None:
         inbox.untrusted = untrusted[moved]
@@ -172,10 +169,10 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
 
 
 def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mask) -> Mask | None:
-    """True where the counters' errors have reached COUNTER_ERRORS and not 0 since; None where they are nowhere.
+    """True from the frame whose error is the last of COUNTER_ERRORS until no error is left; None without any error.
 
-    A counter that does not go on by one is one error, and takes one back where it does.  The same counter with another
-    payload is all of them at once: only a second sender, or a broken one, does that.
+    A counter that does not go on by one is an error; one that does takes an error back.  The same counter with another
+    payload is COUNTER_ERRORS at once: only a second sender, or a broken one, sends it.
     """
     wrong = follows & (step != 1)
     if not inbox.counter_errors and not wrong.any():

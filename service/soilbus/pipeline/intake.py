@@ -241,10 +241,8 @@ class Intake:
         self._binned = frozenset(self.rig.channels)
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
-        self._of_position = {c.name for c in self.channels if c.quantity in POSITION_ROLES}
-        self._positions = PositionTrack(
-            {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}, options.fix_smoothing
-        )
+        self._of_position = {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}
+        self._positions = PositionTrack(self._of_position, options.fix_smoothing)
         self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
         of_effects = delays_of(config) if delays is None else delays
         late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}

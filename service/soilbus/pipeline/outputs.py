@@ -69,7 +69,7 @@ PARAMETER_FRAMES = {
 }
 
 REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error", "second_sender": "bad_counter"}
-"""Names in the value table of reasons of refusal: two mean there that the signal itself has no value, one is newer."""
+"""Names in the value table for reasons of refusal: the signal itself has no value, or a code that older DBCs have."""
 
 HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",

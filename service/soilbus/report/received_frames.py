@@ -33,9 +33,9 @@ BUS_DELAY = 0.2
 SECOND_SENDER_HOLD = 3.0
 """Time [s] for which nothing is trusted after a second sender: as long as soilbus itself says so (dbc/README.md)."""
 IN_A_ROW = 5
-"""Frames in a row, each with the next counter, that a verdict needs (issue 47)."""
+"""Frames in a row, each with the next counter, that go and caution need: in their 0.4 s soilbus itself has spoken."""
 LEAST_CYCLES = 2
-"""Cycle times that these frames take at least: in a shorter time a fast second sender fits between two of soilbus."""
+"""Cycles that these frames take at least: a faster second sender could send five between two frames of soilbus."""
 STATES = ("unknown", "no_go", "caution", "go")
 """States of Traversability, the least first."""
 
