@@ -252,10 +252,15 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")
     sub.add_argument("log", nargs="?", type=Path, metavar="LOG", help="a recording of our frames, played in real time")
+    sub.add_argument("--channel", metavar="NAME", help="of the bus to listen to, such as can0 (default: bus.channel)")
     sub.add_argument(
         "--speed", type=between(0.1, 1000.0), default=1.0, metavar="X", help="play LOG X times as fast (default 1)"
     )
-    sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
+    lines = sub.add_mutually_exclusive_group()
+    lines.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
+    lines.add_argument(
+        "--json", action="store_true", help="a line of JSON for each window, for programs that send results on"
+    )
     sub.add_argument("--seconds", type=between(0.0, 1e6), metavar="S", help="stop after this time")
 
     sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")

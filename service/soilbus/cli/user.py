@@ -6,6 +6,7 @@ Each function takes the parsed arguments and imports what it needs, so that `run
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
@@ -150,15 +151,21 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 def watch(args: argparse.Namespace) -> None:
     """`soilbus watch`: the dashboard of the live bus or of a recording."""
     from soilbus.can.bus import BusError
+    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError
     from soilbus.report.watch import watch, watch_log
 
+    if args.channel is not None:
+        if args.log is not None:
+            raise ConfigError([f"--channel {args.channel}: {args.log} is a recording, which has no bus"])
+        args.set.append(f"bus.channel={json.dumps(args.channel)}")
     config, is_named = configured_or_reference(args), args.config is not None
+    how = is_named, args.seconds, args.plain, args.json
     try:
         if args.log is None:
-            watch(config, is_named, args.seconds, args.plain)
+            watch(config, *how)
         else:
-            watch_log(config, args.log, args.speed, is_named, args.seconds, args.plain)
+            watch_log(config, args.log, args.speed, *how)
     except (BusError, LogError) as error:
         raise WorkError(str(error)) from None
 

@@ -40,7 +40,6 @@ __all__ = [
     "Estimator",
     "Form",
     "Model",
-    "Mqtt",
     "Noise",
     "NoiseOfChannels",
     "Output",
@@ -884,33 +883,6 @@ class J1939(_Section):
     """2: agriculture and forestry."""
 
 
-class Mqtt(_Section):
-    """A broker that each window is published to, as JSON; only `soilbus run`, and only where this section stands.
-
-    Username and password are not written here: SOILBUS_MQTT_USERNAME and SOILBUS_MQTT_PASSWORD in the environment, or
-    systemd's credentials `mqtt-username` and `mqtt-password`.
-    """
-
-    host: Annotated[str, Field(min_length=1)]
-    """Name or address of the broker."""
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """By default 1883, with `tls` 8883."""
-    topic: Annotated[str, Field(pattern=r"^[^#+\s/]+(/[^#+\s/]+)*$")] = "soilbus"
-    """`TOPIC/window` and `TOPIC/status` are published."""
-    rate: Annotated[PositiveFloat, Field(le=10.0)] = 1.0
-    """Windows a second at most; those in between are left out."""
-    tls: bool = False
-    """Encrypted, the broker's certificate checked."""
-    ca: str | None = None
-    """File of the certificate authority for `tls`, beside the configuration; by default the system's."""
-
-    @model_validator(mode="after")
-    def _ca_with_tls(self) -> Mqtt:
-        if self.ca is not None and not self.tls:
-            raise ValueError("ca has no meaning without tls = true")
-        return self
-
-
 class Config(_Section):
     """The whole configuration."""
 
@@ -930,7 +902,6 @@ class Config(_Section):
     model: Model = Model()
     output: Output = Output()
     j1939: J1939 = J1939()
-    mqtt: Mqtt | None = None
     folder: Path = Field(default=Path("."), exclude=True)
 
     @model_validator(mode="before")
