@@ -231,7 +231,7 @@ def command_line() -> argparse.ArgumentParser:
         "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
     )
 
-    sub = command("batch", "many logs of many vehicles, on Dask (extra: batch)")
+    sub = command("batch", "many logs of many vehicles, on all cores or on a Dask cluster (extra: batch)")
     sub.add_argument(
         "logs", nargs="+", metavar="LOG",
         help="log, folder, glob, URL, or manifest: a CSV or Parquet file with log, vehicle, configuration, start",
@@ -240,7 +240,7 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="of Dask, such as tcp://10.0.0.1:8786; by default processes of this machine",
+        help="of Dask, such as tls://10.0.0.1:8786; by default processes of this machine, which open no port",
     )
     sub.add_argument("--resume", action="store_true", help="go on with DIR: logs that are done are not read again")
     sub.add_argument(

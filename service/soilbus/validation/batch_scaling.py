@@ -3,7 +3,7 @@
     python -m soilbus.validation.batch_scaling [--logs 8] [--seconds 60] [--workers 2]
 
 The same simulated logs are replayed three ways in one run: one after the other in one process, by a pool of
-multiprocessing, and by Dask as `soilbus batch` does.  Workers are started, and have replayed a log, before the clock
+multiprocessing, and as `soilbus batch` does.  Workers are started, and have replayed a log, before the clock
 runs.  On a machine with other work only the ratio of the two parallel ways and the CPU seconds mean something; the load
 is printed beside them.
 """
@@ -61,8 +61,8 @@ def by_multiprocessing(jobs: Sequence[Job], workers: int) -> tuple[float, list[O
         return time.perf_counter() - begin, outcomes
 
 
-def by_dask(jobs: Sequence[Job], workers: int) -> tuple[float, list[Outcome]]:
-    """The same with Dask's processes."""
+def by_batch(jobs: Sequence[Job], workers: int) -> tuple[float, list[Outcome]]:
+    """The same with the processes of `soilbus batch`."""
     with cluster(None, print, workers) as client:
         client.run(replayed, jobs[0])
         begin = time.perf_counter()
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hours = chosen.logs * chosen.seconds / 3600.0
         alone: float | None = None
         parts: list[bytes | None] = []
-        for way in (in_one_process, by_multiprocessing, by_dask):
+        for way in (in_one_process, by_multiprocessing, by_batch):
             load = os.getloadavg()[0]
             wall, outcomes = way(jobs, chosen.workers)
             alone, parts = alone or wall, parts or [outcome.part for outcome in outcomes]
