@@ -9,9 +9,18 @@ import argparse
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from soilbus import __version__
+from soilbus.words import shown
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors show names of files as a terminal may have them: a shell makes arguments of names."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and error, and leave with exit code 2."""
+        super().error(shown(message))
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
@@ -96,7 +105,7 @@ def named(*suffixes: str) -> Callable[[str], Path]:
 
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
-    parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
+    parser = _Parser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
     parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -66,14 +67,12 @@ def init(args: argparse.Namespace) -> None:
         found = weighed(found, recording)
         facts = facts_of(assigned(found), recording)
     files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
-    words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
-    made = proposal(database, assigned(found), facts, files, " ".join(words))
+    log = [] if args.log is None else ["--log", str(args.log)]
+    words = ["soilbus", "init", *(word for path in args.dbc for word in ("--dbc", str(path))), *log]
+    made = proposal(database, assigned(found), facts, files, shlex.join(words))
     write_text(args.out, made.text)
-    log = f" --log {args.log}" if args.log else ""
-    say(
-        f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then'
-        f" soilbus check --config {'soilbus.toml' if to_stdout else args.out}{log}"
-    )
+    then = shlex.join(["soilbus", "check", "--config", "soilbus.toml" if to_stdout else str(args.out), *log])
+    say(f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then {then}')
 
 
 def run(args: argparse.Namespace) -> None:

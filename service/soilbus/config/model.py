@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from soilbus.grouping import grouped
-from soilbus.words import did_you_mean
+from soilbus.words import did_you_mean, shown
 
 __all__ = [
     "J1939",
@@ -67,13 +67,8 @@ class ConfigError(Exception):
     """The configuration cannot be used; `faults` holds one line for each fault, without line breaks of names."""
 
     def __init__(self, faults: Iterable[str]) -> None:
-        self.faults = [_printable(fault) for fault in faults]
+        self.faults = [shown(fault) for fault in faults]
         super().__init__("\n".join(self.faults))
-
-
-def _printable(text: str) -> str:
-    """The text with line breaks and other control characters as Python writes them."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 @dataclass(frozen=True)

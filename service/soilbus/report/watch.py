@@ -35,6 +35,7 @@ from soilbus.report.driver_page import driver_page
 from soilbus.report.engineer_page import engineer_page
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.received_record import gist, received_record
+from soilbus.words import shown
 
 __all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch", "watch_log"]
 
@@ -322,7 +323,7 @@ def print_results(
 def _take(dashboard: Dashboard, source: Source, timeout: float) -> Received | can.Message | None:
     """Feed the next frame, if one comes in time."""
     message = source.receive(max(0.0, timeout))
-    dashboard.fault = source.fault
+    dashboard.fault = shown(source.fault)
     if message is not None:
         dashboard.known.receive(message)
         dashboard.sample()
