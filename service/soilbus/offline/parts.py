@@ -38,7 +38,7 @@ from soilbus.config.file import located
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
-from soilbus.offline.replay import LogError, OtherBus, replay
+from soilbus.offline.replay import LogError, OtherBus, log_names, replay
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import flat_record, window_record
 from soilbus.pipeline.pipeline import Pipeline
@@ -308,11 +308,13 @@ def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int) -> Outcome:
     fault: LogError | None = None
     pipeline = None if database is None else Pipeline(config, database)
 
+    (label,) = log_names([path])
+
     def written() -> Iterator[bytes]:
         nonlocal fault
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
-                run = (result.log or "").removeprefix(path.name) if pipeline is None else ""  # of a table: its soil bed
+                run = (result.log or "").removeprefix(label) if pipeline is None else ""  # of a table: its soil bed
                 row = summary.row(replace(result, log=job.log + run))
                 yield json.dumps(row, allow_nan=False).encode() + b"\n"
         except LogError as error:
