@@ -13,6 +13,7 @@ import random
 import re
 import shutil
 import tomllib
+import warnings
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -64,10 +65,12 @@ def says(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
     def run(*words: object) -> tuple[int, str, str]:
         capfd.readouterr()
-        try:
-            code = main([str(word) for word in words])
-        except SystemExit as ended:  # of argparse
-            code = int(str(ended.code))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # it would be printed as it is
+            try:
+                code = main([str(word) for word in words])
+            except SystemExit as ended:  # of argparse
+                code = int(str(ended.code))
         out, err = capfd.readouterr()
         for line in (out + err).split("\n"):
             assert line.isprintable(), line
@@ -157,7 +160,7 @@ def test_a_diagnosis_and_a_batch_show_names_as_text(name, drive, tmp_path, says)
     name = name.replace("/", "_")
     log, other = tmp_path / f"{name}.log", tmp_path / "other.log"
     shutil.copy(drive, log)
-    shutil.copy(drive, other)
+    assert says("simulate", "--duration", "9", "--seed", "5", "--log", other)[0] == 0
     found, page, model = (tmp_path / each for each in ("d.json", "d.html", f"{name}.toml"))
     command = ["diagnose", "--config", "tractor", *SHORT, log, other, "--json", found, "--report", page]
     assert says(*command, "--model-out", model)[0] == 0

@@ -10,6 +10,7 @@ import base64
 import hashlib
 import io
 import shlex
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -192,5 +193,7 @@ def picture(draw: Callable[[Any], None], height: float, words: str, width: float
     with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(width, height), layout="constrained")
         draw(figure)
-        figure.savefig(png, format="png", dpi=dpi)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph")  # of a log's name; the page itself has it
+            figure.savefig(png, format="png", dpi=dpi)
     return Picture(words, base64.b64encode(png.getvalue()).decode())
