@@ -195,6 +195,8 @@ def test_a_diagnosis_and_a_batch_show_names_as_text(name, drive, tmp_path, says)
         "simulate --manoeuvre FILE.json --log FILE.log", "simulate --log FILE/no.log", "watch FILE.log extra FILE",
         "docs FILE", "effects FILE", "simulate --soil FILE --log x.log", "simulate --effect FILE=1 --log x.log",
         "check --config tractor --set FILE=1", "watch --json --channel FILE", "replay --config tractor FILE.log --FILE",
+        "montecarlo --config FILE.toml", "decisions --config FILE.toml", "completion FILE", "paper --seed FILE",
+        "demo --picture FILE/FILE.svg", "FILE",
     ],
 )  # fmt: skip
 def test_what_is_not_there_is_one_printable_line(words, name, tmp_path, monkeypatch, says):

@@ -57,7 +57,7 @@ from soilbus.offline.parts import (
     summary_of_part,
 )
 from soilbus.pipeline.outputs import known
-from soilbus.words import one_line
+from soilbus.words import one_line, shown
 
 __all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch", "workers_watched"]
 
@@ -356,7 +356,12 @@ def run_batch(
         job.digest: summary for job in jobs if (summary := summary_of_part(_part_path(parts, job.digest))) is not None
     }
     errors = [
-        {"vehicle": job.vehicle, "log": job.log, "windows": summary["windows.all"] if summary else 0, "fault": fault}
+        {
+            "vehicle": job.vehicle,
+            "log": job.log,
+            "windows": summary["windows.all"] if summary else 0,
+            "fault": shown(fault),
+        }
         for job in jobs
         for summary in [summaries.get(job.digest)]
         if (fault := summary["fault"] if summary else of_logs[job.digest].fault)
