@@ -232,7 +232,7 @@ class Intake:
         delays: Mapping[str, float] | None = None,
         options: ReceptionOptions = RECEPTION,
     ) -> None:
-        self._config, self._database, self._delays, self._options = config, database, delays, options
+        self.config, self._database, self._delays, self._options = config, database, delays, options
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config, database))
         self.rig = rig_of(config)
@@ -259,7 +259,7 @@ class Intake:
 
     def of_another_recording(self) -> Intake:
         """A new intake without any data, which continues the counts of windows, frames and refusals."""
-        other = Intake(self._config, self._database, self._delays, self._options)
+        other = Intake(self.config, self._database, self._delays, self._options)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
         return other
@@ -369,7 +369,7 @@ class Intake:
         window = completed(raw, self.rig)
         self.refusals.note_outliers(bins.new_outliers())
         missing = [c.name for c in self.needed if c.name not in self.last_seen]
-        missing += ["ground_speed"] if self._config.signals.ground_speed is None else []
+        missing += ["ground_speed"] if self.config.signals.ground_speed is None else []
         missing += [] if self.rig.wheels else ["wheels"]
         covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
         stale = self.stale(end)

@@ -31,6 +31,8 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     """
     counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
+    if counts.elsewhere:
+        heard += f"; {counts.elsewhere} frames of other channels left out"
     if pipeline.admission.missed:
         heard += f"; {pipeline.admission.missed} skipped by their counters"
     return summary_of(results, heard, refusals.used, refusals.total, shows_no_slope(pipeline.config))
