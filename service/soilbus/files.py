@@ -79,12 +79,12 @@ def opened(path: Path) -> Iterator[io.BufferedReader]:
     is_stdin = str(path) == "-"
     with (
         open(sys.stdin.fileno() if is_stdin else path, "rb", buffering=0, closefd=not is_stdin) as file,
-        unpacked(file) as stream,
+        plain_bytes(file) as stream,
     ):
         yield stream
 
 
-def unpacked(file: Any) -> io.BufferedReader:
+def plain_bytes(file: Any) -> io.BufferedReader:
     """A stream of the plain bytes of an unbuffered binary file, which may be packed; as `opened`."""
     packed = _Counted(file)
     return io.BufferedReader(_Unpacked(packed), _BUFFER)
@@ -103,13 +103,10 @@ def text_lines(stream: BinaryIO) -> Iterator[str]:
     mark = stream.peek(2)[:2] if isinstance(stream, io.BufferedReader) else b""
     encoding = "utf-16" if mark in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
     text = io.TextIOWrapper(stream, encoding, errors="cp1252")
-    try:
-        for line in iter(partial(text.readline, LIMITS.line), ""):
-            if len(line) == LIMITS.line and line[-1] != "\n":
-                raise ValueError(f"a line of more than {LIMITS.line} characters")
-            yield line
-    finally:
-        text.detach()
+    for line in iter(partial(text.readline, LIMITS.line), ""):
+        if len(line) == LIMITS.line and line[-1] != "\n":
+            raise ValueError(f"a line of more than {LIMITS.line} characters")
+        yield line
 
 
 def _of_code_page(error: UnicodeError) -> tuple[str, int]:

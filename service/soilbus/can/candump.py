@@ -140,7 +140,8 @@ def candump_batches(lines: Iterable[str]) -> Iterator[Batch]:
         if plain is not None:
             yield plain
         else:
-            yield from (of_message(message) for message in can.CanutilsLogReader(map(log_line, batch)))  # type: ignore[arg-type]
+            lines = (log_line(line) for line in batch)
+            yield from (of_message(message) for message in can.CanutilsLogReader(lines))  # type: ignore[arg-type]
 
 
 def of_message(message: can.Message, first: int = 0) -> Batch:

@@ -89,7 +89,7 @@ _ASC_LINE = re.compile(
     re.IGNORECASE,
 )
 _TRC_LINE = re.compile(r"\d+\)\s+\d")
-_ASC_NO_FRAME = re.compile(r"\s*[\d.]+\s+(CANFD\s+(?!\d)|.*\sTxRq\s)")
+_ASC_NO_FRAME = re.compile(r"\s*+[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s)")
 """Events that python-can would take for frames: "Start of measurement" of CAN FD, requests to send."""
 RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 

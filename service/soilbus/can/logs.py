@@ -70,7 +70,7 @@ class Log:
 
     def __init__(self, path: Path, channel: str = "", demanded: bool = False) -> None:
         self.path, self.wanted, self._demanded = path, channel, demanded
-        self.kind, self.chosen, self.span = "", "", 0.0
+        self.kind, self.chosen, self.span, self._given = "", "", 0.0, 0
         self.channels: Counter[str] = Counter()
 
     @property
@@ -132,8 +132,7 @@ class Log:
         return fault
 
     def _damage(self, error: Exception) -> str:
-        n = self.channels.total()
-        what = f"cut off or damaged after {n} frames" if n else "not a CAN log that can be read"
+        what = f"cut off or damaged after {self._given} frames" if self._given else "not a CAN log that can be read"
         why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 150)
         return f"{self.name}: {what} ({why})"
 
@@ -191,6 +190,7 @@ class Log:
 
     def _of_channel(self, batch: Batch) -> list[Frame]:
         channels, frames = batch
+        self._given += len(frames)
         if not self.wanted or set(channels) <= {self.chosen}:
             return frames
         return [frame for channel, frame in zip(channels, frames, strict=True) if channel == self.chosen]

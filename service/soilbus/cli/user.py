@@ -72,10 +72,10 @@ def init(args: argparse.Namespace) -> None:
     words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
     made = proposal(database, assigned(found), facts, files, " ".join(words))
     write_text(args.out, made.text)
-    log = f" --log {args.log}" if args.log else ""
+    with_log = f" --log {args.log}" if args.log else ""
     say(
         f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then'
-        f" soilbus check --config {'soilbus.toml' if to_stdout else args.out}{log}"
+        f" soilbus check --config {'soilbus.toml' if to_stdout else args.out}{with_log}"
     )
 
 

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 from soilbus.can.log_formats import is_csv_of_frames
 from soilbus.config.model import Config
-from soilbus.files import opened, read_all, text_lines, unpacked
+from soilbus.files import opened, plain_bytes, read_all, text_lines
 from soilbus.offline import dataset
 from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
 from soilbus.offline.tables import MISSING_CELLS, check_cells, separator_of
@@ -153,7 +153,7 @@ def _opened(argument: str) -> Iterator[BinaryIO]:
     import fsspec
 
     with fsspec.open(argument, "rb") as file:
-        yield unpacked(file)
+        yield plain_bytes(file)
 
 
 def _entry(manifest: str, number: int, row: Mapping[str, Any]) -> dict[str, str]:

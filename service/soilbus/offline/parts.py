@@ -37,7 +37,7 @@ from soilbus.config.file import located
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
-from soilbus.files import opened, text_lines, unpacked
+from soilbus.files import opened, plain_bytes, text_lines
 from soilbus.offline.replay import LogError, OtherBus, replay
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import flat_record, window_record
@@ -473,6 +473,6 @@ def pieces_of_part(path: Path, sizes: Sequence[int]) -> Iterator[bytes]:
 
 def rows_of_piece(piece: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
     """The windows of a piece as rows of a table, `at_once` or fewer at a time."""
-    lines = text_lines(unpacked(BytesIO(piece)))
+    lines = text_lines(plain_bytes(BytesIO(piece)))
     while rows := [json.loads(line) for line in islice(lines, at_once)]:
         yield rows
