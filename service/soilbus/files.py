@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +95,13 @@ def packing(stream: io.BufferedReader) -> str:
     return stream.raw.packing if isinstance(stream.raw, _Unpacked) else ""
 
 
-def text_lines(stream: BinaryIO) -> Iterator[str]:
+def text_lines(stream: io.BufferedReader) -> Iterator[str]:
     """The lines of a text file, none of which takes more memory than `Limits.line`; ValueError for a longer one.
 
     UTF-8, or UTF-16 with its byte order mark; other bytes are of Windows' code page, as programs there write them.
     """
-    mark = stream.peek(2)[:2] if isinstance(stream, io.BufferedReader) else b""
-    encoding = "utf-16" if mark in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
-    text = io.TextIOWrapper(stream, encoding, errors="cp1252")
+    is_wide = stream.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    text = io.TextIOWrapper(stream, "utf-16" if is_wide else "utf-8-sig", errors="cp1252")
     for line in iter(partial(text.readline, LIMITS.line), ""):
         if len(line) == LIMITS.line and line[-1] != "\n":
             raise ValueError(f"a line of more than {LIMITS.line} characters")

@@ -191,7 +191,7 @@ def _is_machine(configuration: Path) -> bool:
 
 def _csv_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
     """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
-    text = text_lines(BytesIO(read_all(file)))
+    text = text_lines(plain_bytes(BytesIO(read_all(file))))
     first = next(text, "")
     table = csv.reader(chain([first], text), delimiter=separator_of(first.lower(), MANIFEST_COLUMNS), strict=True)
     header = [name.strip().lower() for name in next(table, [])]

@@ -27,7 +27,7 @@ from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
 from soilbus.estimation.window import Rig, Window, window_of_samples
-from soilbus.files import LIMITS, opened, read_all, text_lines
+from soilbus.files import LIMITS, opened, plain_bytes, read_all, text_lines
 from soilbus.offline.recordings import Recordings, check_different
 from soilbus.offline.replay import LogError, log_names
 from soilbus.pipeline.estimator import WindowEstimator
@@ -295,7 +295,7 @@ def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
     """Rows of a file with cells, and what separates these."""
     try:
         with opened(path) as stream:
-            lines = text_lines(BytesIO(read_all(stream)))
+            lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
             first = next((line for line in lines if line.strip()), "")
             separator = separator_of(first, needed)
             rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)

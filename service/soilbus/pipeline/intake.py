@@ -326,7 +326,10 @@ class Intake:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
     def due(self, now: float) -> list[WindowTask]:
-        """All windows that ended at or before `now` [s] and were not returned yet."""
+        """All windows that ended at or before `now` [s] and were not returned yet.
+
+        A hop without any sample ends no window: its data would be those of the one before.
+        """
         tasks, self._ready = self._ready, []
         if self._bins is None:
             self.ingest(now)
@@ -336,7 +339,8 @@ class Intake:
                 self._screen_the_rest()
                 self._restart()
                 break
-            tasks.append(self._task(self._bins, self.next_end))
+            if self.next_end - self._newest <= self._settings.hop:
+                tasks.append(self._task(self._bins, self.next_end))
             self.next_end += self._settings.hop
         return tasks
 
