@@ -109,7 +109,7 @@ def text_lines(stream: io.BufferedReader) -> Iterator[str]:
 
 
 def _of_code_page(error: UnicodeError) -> tuple[str, int]:
-    if not isinstance(error, UnicodeDecodeError):
+    if not isinstance(error, UnicodeDecodeError) or error.encoding.startswith("utf-16"):
         raise error
     return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
 

@@ -65,7 +65,7 @@ class Log:
     chosen
         The channel whose frames are handed out.
     span
-        Time from the first to the last frame read [s].
+        Time from the first frame to the latest one read [s].
     """
 
     def __init__(self, path: Path, channel: str = "", demanded: bool = False) -> None:
@@ -169,7 +169,7 @@ class Log:
         for channels, frames in found.batches(stream):
             if frames:
                 first = frames[0][0] if math.isnan(first) else first
-                self.span = frames[-1][0] - first
+                self.span = max(self.span, frames[-1][0] - first)
             self.channels.update(channels)
             within_ratio(size, LEAST_FRAME * self.channels.total())
             yield channels, frames
