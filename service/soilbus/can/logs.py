@@ -169,7 +169,7 @@ class Log:
         for channels, frames in found.batches(stream):
             if frames:
                 first = frames[0][0] if math.isnan(first) else first
-                self.span = max(self.span, frames[-1][0] - first)
+                self.span = max(self.span, max(frame[0] for frame in frames) - first)
             self.channels.update(channels)
             within_ratio(size, LEAST_FRAME * self.channels.total())
             yield channels, frames
