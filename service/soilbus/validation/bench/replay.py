@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import can
+
 from soilbus.can.dbc_files import load_databases
-from soilbus.offline.replay import estimator_beside, read_log, replay
+from soilbus.offline.replay import estimator_beside, replay
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.validation.bench.figure import Figure, in_turn, wall_time
@@ -27,8 +29,9 @@ def replay_realtime_factor(log: Path, seconds: float) -> Figure:
                 pass
 
     def only_read() -> None:
-        for _ in read_log(log):
-            pass
+        with can.LogReader(log) as reader:
+            for _ in reader:
+                pass
 
     ours, peer = wall_time(whole, 3), wall_time(only_read, 3)
     return Figure(
@@ -46,8 +49,9 @@ def replay_one_core_factor(log: Path, seconds: float) -> Figure:
             pass
 
     def only_read() -> None:
-        for _ in read_log(log):
-            pass
+        with can.LogReader(log) as reader:
+            for _ in reader:
+                pass
 
     ours, peer = in_turn((whole, only_read), 3)
     return Figure(
