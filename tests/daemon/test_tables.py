@@ -227,14 +227,12 @@ def test_a_packed_table_is_read_as_the_plain_one_within_limits(tmp_path):
 
 def test_a_parquet_file_of_too_many_cells_is_refused_before_it_is_read(tmp_path):
     arrow = pytest.importorskip("pyarrow")
-    column = arrow.array(np.zeros(4_000_000, np.int8))
+    column, path = arrow.array(np.zeros(4_000_000, np.int8)), tmp_path / "t.parquet"
     names = ["bed", "load", "slip", "pull", "torque", "sink"]
-    pytest.importorskip("pyarrow.parquet").write_table(
-        arrow.table(dict.fromkeys(names, column)), tmp_path / "t.parquet"
-    )
+    pytest.importorskip("pyarrow.parquet").write_table(arrow.table(dict.fromkeys(names, column)), path)
     assert path.stat().st_size < 100_000
     with pytest.raises(TableError, match="20000000 cells are too many"):
-        runs_of(rig(), tmp_path / "t.parquet")
+        runs_of(rig(), path)
 
 
 def test_parquet_tells_the_same_as_csv(tmp_path, measured):
