@@ -118,12 +118,13 @@ def bursts(gap: float) -> str:
     )
 
 
-def test_silence_makes_no_windows(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gap", [59.0, 61.5])
+def test_bursts_far_apart_make_few_windows(gap: float, tmp_path: Path) -> None:
     config = reference_configuration()
     path = tmp_path / "gaps.log"
-    path.write_text(bursts(59.0))
+    path.write_text(bursts(gap))
     windows = list(replay(Pipeline(config, load_databases(config)), [path]))
-    assert len(windows) <= 30  # one for each burst; each second had one before
+    assert len(windows) <= 60 + 2 * 30  # a minute of silence, and two for each burst; each second had one before
 
 
 # --- channels
