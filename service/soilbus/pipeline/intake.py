@@ -234,7 +234,7 @@ class Intake:
         delays: Mapping[str, float] | None = None,
         options: ReceptionOptions = RECEPTION,
     ) -> None:
-        self._config, self._database, self._delays, self._options = config, database, delays, options
+        self.config, self._database, self._delays, self._options = config, database, delays, options
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config, database))
         self.rig = rig_of(config)
@@ -253,6 +253,7 @@ class Intake:
         self._limits = ReportedLimits(motors_of(config, self.rig), options.limit_samples)
         self._index = 0
         self.epoch = 0
+        self._silent_hops = LONGEST_GAP / config.estimator.hop  # that may still end windows
         self._ready: list[WindowTask] = []
         self._bins: Bins | None = None
         self._restart()
@@ -260,7 +261,7 @@ class Intake:
 
     def of_another_recording(self) -> Intake:
         """A new intake without any data, which continues the counts of windows, frames and refusals."""
-        other = Intake(self._config, self._database, self._delays, self._options)
+        other = Intake(self.config, self._database, self._delays, self._options)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
         return other
@@ -330,7 +331,11 @@ class Intake:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
     def due(self, now: float) -> list[WindowTask]:
-        """All windows that ended at or before `now` [s] and were not returned yet."""
+        """All windows that ended at or before `now` [s] and were not returned yet.
+
+        Hops without any sample end windows for LONGEST_GAP in all; each hop with samples earns one more.  So a log of
+        short bursts far apart makes at most two windows a burst.
+        """
         tasks, self._ready = self._ready, []
         if self._bins is None:
             self.ingest(now)
@@ -340,7 +345,11 @@ class Intake:
                 self._screen_the_rest()
                 self._restart()
                 break
-            tasks.append(self._task(self._bins, self.next_end))
+            is_heard = self.next_end - self._newest <= self._settings.hop
+            if is_heard or self._silent_hops >= 1.0:
+                tasks.append(self._task(self._bins, self.next_end))
+            change = 1.0 if is_heard else -1.0
+            self._silent_hops = min(max(self._silent_hops + change, 0.0), LONGEST_GAP / self._settings.hop)
             self.next_end += self._settings.hop
         return tasks
 
@@ -373,7 +382,7 @@ class Intake:
         window = completed(raw, self.rig)
         self.refusals.note_outliers(bins.new_outliers())
         missing = [c.name for c in self.needed if c.name not in self.last_seen]
-        missing += ["ground_speed"] if self._config.signals.ground_speed is None else []
+        missing += ["ground_speed"] if self.config.signals.ground_speed is None else []
         missing += [] if self.rig.wheels else ["wheels"]
         covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
         stale = self.stale(end)
