@@ -17,8 +17,8 @@ from single_wheel import NOISE, RADIUS, RIG, WIDTH, noisy, sweep, write_csv
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
 from soilbus.diagnosis.diagnose import NotFitted
+from soilbus.offline.columns import TableError
 from soilbus.offline.replay import LogError
-from soilbus.offline.tables import TableError
 from soilbus.simulator.reference import TRACTOR
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active

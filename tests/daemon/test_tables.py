@@ -24,9 +24,9 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
+from soilbus.offline.columns import TableError
 from soilbus.offline.diagnose import diagnose_logs
 from soilbus.offline.tables import (
-    TableError,
     candidates,
     recordings_of_tables,
     replay_tables,

@@ -19,7 +19,8 @@ from soilbus.config.file import load_config, parse_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import NotFitted
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior
-from soilbus.offline.tables import Run, TableError, replay_runs, runs_of_columns
+from soilbus.offline.columns import TableError
+from soilbus.offline.tables import Run, replay_runs, runs_of_columns
 from soilbus.report.soil_prior import SHOWN
 from soilbus.terra.wheel import Soil
 from soilbus.words import did_you_mean

@@ -9,6 +9,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+WHOLE = ""
+"""Name of the signal that is the whole of its message: a column of a table."""
+
 
 class Reason(StrEnum):
     """Why a frame or a value was not admitted; each is counted."""
@@ -30,6 +33,11 @@ class Reason(StrEnum):
     NOT_FINITE = "not_finite"
     IMPLAUSIBLE = "implausible"
     NOT_VALID = "not_valid"
+
+
+def path_of(message: str, signal: str) -> str:
+    """`Message.Signal`, or the name of a column."""
+    return message if signal == WHOLE else f"{message}.{signal}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +69,11 @@ class Channel:
     def name(self) -> str:
         """Such as "torque.FL", or "draft" for a channel of the whole vehicle."""
         return f"{self.quantity}.{self.wheel}" if self.wheel else self.quantity
+
+    @property
+    def path(self) -> str:
+        """`Message.Signal`, or the name of a column."""
+        return path_of(self.message, self.signal)
 
 
 @dataclass(slots=True)

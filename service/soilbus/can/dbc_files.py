@@ -12,6 +12,7 @@ from typing import Any
 from cantools.database.can import Database, Message
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
+from soilbus.can.columns import column_database, mapped_columns
 from soilbus.can.dbc_text import check_multiplexers, message_names, of_messages
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
@@ -28,13 +29,15 @@ _SIGNAL = re.compile(r"(\w+)\.\w+")
 
 
 def load_databases(config: Config, mapped_only: bool = False) -> Database:
-    """All DBC files of the configuration as one database.
+    """All DBC files of the configuration as one database; with [columns] the mapped columns as one.
 
     With `mapped_only` messages are left out that can have no say in what is mapped, unless a mapped one is missing.
 
     Raises ConfigError with a line for each file that is missing or not a DBC, and for each
     message that two files define differently.
     """
+    if config.columns is not None:
+        return column_database(mapped_columns(config))
     faults: list[str] = []
     if not config.dbc.input:
         faults.append("dbc.input: no DBC file given")

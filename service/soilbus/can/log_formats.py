@@ -289,7 +289,7 @@ def _blf(stream: BufferedReader) -> Iterator[Batch]:
 
 
 @contextmanager
-def _placed(stream: BufferedReader) -> Iterator[Path]:
+def placed_copy(stream: BufferedReader) -> Iterator[Path]:
     """The path of a copy of a stream, for libraries that go to and fro in a file."""
     with NamedTemporaryFile(prefix="soilbus-") as file:
         copyfileobj(stream, file)
@@ -303,8 +303,8 @@ _MF4_BLOCK = re.compile(rb"##DZ....(.{8})\0{8}(..)([\0-\xff]).(.{4})(.{8})(.{8})
 def _mf4(stream: BufferedReader) -> Iterator[Batch]:
     if can.io.mf4.asammdf is None:  # type: ignore[attr-defined]
         raise MissingExtraError("this format needs soilbus[mf4]")
-    with _placed(stream) as path:
-        _check_mf4_blocks(path)
+    with placed_copy(stream) as path:
+        check_mf4_blocks(path)
         is_empty = True
         with _mf4_reader(path) as reader:
             for message in reader:
@@ -327,7 +327,7 @@ def _mf4_reader(path: Path) -> can.MF4Reader:
         sys.unraisablehook = usual
 
 
-def _check_mf4_blocks(path: Path) -> None:
+def check_mf4_blocks(path: Path) -> None:
     """Raise ValueError where a deflated block unpacks to more than its size allows."""
     size = path.stat().st_size
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -350,7 +350,7 @@ _SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messa
 
 def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
     """Frames of python-can's SQLite log; a view, a function or a virtual table in their place is refused."""
-    with _placed(stream) as path, closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as log:
+    with placed_copy(stream) as path, closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as log:
         log.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LIMITS.line)
         log.execute("PRAGMA trusted_schema = OFF")
         kinds = log.execute("SELECT type, sql FROM sqlite_schema WHERE name = 'messages'").fetchall()

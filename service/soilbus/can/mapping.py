@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from cantools.database.can import Database, Message, Signal
 
-from soilbus.can.channels import Channel
+from soilbus.can.channels import WHOLE, Channel
 from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
@@ -153,7 +153,11 @@ def _measured_once(config: Config) -> Iterator[_Role]:
 
 
 def _channel(config: Config, database: Database, role: _Role) -> Channel:
-    message, signal = _find(database, role.mapped.signal)
+    message, signal = found_signal(database, role.mapped.signal)
+    if role.mapped.unit is not None and signal.name != WHOLE:
+        raise _Fault(f"unit is for the columns of a table: {signal.name} has the unit that the DBC says")
+    if role.mapped.valid is not None and signal.name == WHOLE:
+        raise _Fault("valid is for messages; of a column leave those cells empty that do not count")
     low, high = plausible(config, role.quantity, role.part)
     valid_signal, valid_values = _validity(message, role.mapped)
     return Channel(
@@ -180,9 +184,12 @@ def _usual_timeout(role: _Role, message: Message) -> float | None:
     return max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
 
 
-def _find(database: Database, path: str) -> tuple[Message, Signal]:
-    message_name, _, signal_name = path.partition(".")
+def found_signal(database: Database, path: str) -> tuple[Message, Signal]:
+    """The message and signal of a "Message.Signal", or of a column by its name."""
     messages = {m.name: m for m in database.messages}
+    if path in messages and messages[path].signals[0].name == WHOLE:
+        return messages[path], messages[path].signals[0]
+    message_name, _, signal_name = path.partition(".")
     message = messages.get(message_name)
     if message is None:
         raise _Fault(f"no message {message_name} in the DBC{did_you_mean(message_name, messages)}")
@@ -264,24 +271,28 @@ def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
     except ValueError as error:
         spelled = (signal.unit or "").strip()
         if spelled in _CURRENTS and quantity in ("torque", "torque_limit"):
-            raise _Fault(f"{signal.name} is in {spelled}, a current: give its torque_constant [N m/A]") from None
+            raise _Fault(f"{_called(signal)} is in {spelled}, a current: give its torque_constant [N m/A]") from None
         if spelled in _PRESSURES and quantity == "load":
-            raise _Fault(f"{signal.name} is in {spelled}, a pressure: give effective_area [m^2]") from None
-        raise _Fault(f"{signal.name}: {error} ({quantity} needs {wanted})") from None
+            raise _Fault(f"{_called(signal)} is in {spelled}, a pressure: give effective_area [m^2]") from None
+        raise _Fault(f"{_called(signal)}: {error} ({quantity} needs {wanted})") from None
     if unit is None:
         if quantity in POSITION_ROLES:
-            raise _Fault(f"{signal.name} has no unit: write deg or rad in the DBC")
+            raise _Fault(f"{_called(signal)} has no unit: write deg or rad in the DBC")
         return fitting[0], 1.0
     if unit.dimension not in fitting:
         article = "an" if unit.dimension[0] in "ai" else "a"
-        raise _Fault(f"{signal.name} is in {signal.unit}, {article} {unit.dimension}; {quantity} needs {wanted}")
+        raise _Fault(f"{_called(signal)} is in {signal.unit}, {article} {unit.dimension}; {quantity} needs {wanted}")
     return unit.dimension, unit.factor
+
+
+def _called(signal: Signal) -> str:
+    return signal.name or "the column"
 
 
 def _code(quantity: str, signal: Signal) -> tuple[str, float]:
     """No dimension; a fault for a signal with a unit of one."""
     if _has_dimension(signal):
-        raise _Fault(f"{signal.name} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
+        raise _Fault(f"{_called(signal)} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
     return "", 1.0
 
 
@@ -291,7 +302,9 @@ def _pressure(quantity: str, signal: Signal, area: float) -> tuple[str, float]:
         raise _Fault(f"effective_area has no meaning for {quantity}")
     unit = _PRESSURES.get((signal.unit or "Pa").strip())
     if unit is None:
-        raise _Fault(f"{signal.name} is in {signal.unit}; with effective_area it must be a pressure in Pa, kPa or bar")
+        raise _Fault(
+            f"{_called(signal)} is in {signal.unit}; with effective_area it must be a pressure in Pa, kPa or bar"
+        )
     return "force", area * unit
 
 
@@ -301,7 +314,7 @@ def _current(quantity: str, signal: Signal, torque_constant: float) -> tuple[str
         raise _Fault(f"torque_constant has no meaning for {quantity}")
     unit = _CURRENTS.get((signal.unit or "A").strip())
     if unit is None:
-        raise _Fault(f"{signal.name} is in {signal.unit}; with torque_constant it must be a current in A or mA")
+        raise _Fault(f"{_called(signal)} is in {signal.unit}; with torque_constant it must be a current in A or mA")
     return "torque", torque_constant * unit
 
 
@@ -310,7 +323,7 @@ def _percentage(quantity: str, signal: Signal, reference_torque: float) -> tuple
     if quantity not in ("torque", "torque_limit"):
         raise _Fault(f"reference_torque has no meaning for {quantity}")
     if (signal.unit or "").strip() != "%":
-        raise _Fault(f"{signal.name} is in {signal.unit or 'no unit'}; with reference_torque it must be %")
+        raise _Fault(f"{_called(signal)} is in {signal.unit or 'no unit'}; with reference_torque it must be %")
     return "torque", reference_torque / 100.0
 
 
@@ -384,4 +397,4 @@ def _identifiers_shared(channels: Iterable[Channel], database: Database) -> list
     return faults
 
 
-__all__ = ["channels_of", "checked_messages", "load_databases", "plausible", "without_unit"]
+__all__ = ["channels_of", "checked_messages", "found_signal", "load_databases", "plausible", "without_unit"]

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from cantools.database.can import Database, Message, Signal
 
+from soilbus.can.channels import path_of
 from soilbus.can.j1939 import pgn_of
 from soilbus.can.units import Unit, unit_of
 
@@ -204,8 +205,8 @@ class Candidate:
 
     @property
     def path(self) -> str:
-        """`Message.Signal`."""
-        return f"{self.message}.{self.signal}"
+        """`Message.Signal`, or the name of a column."""
+        return path_of(self.message, self.signal)
 
     def changed(self, by: float, note: str = "") -> Candidate:
         """The same with another score, and a note on why."""
@@ -313,7 +314,7 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str]) -> list[
             continue
         score = _score(role, own, around, _words(comment), unit) + _by_range(role, signal, unit, own)
         slot = Slot(role, _place_of(role, place))
-        notes: tuple[str, ...] = ("no unit in the DBC: SI assumed",) if unit is None and dimensions != ("",) else ()
+        notes: tuple[str, ...] = ("no unit: SI assumed",) if unit is None and dimensions != ("",) else ()
         if role in WHEEL_ONLY and slot.place not in WHEELS:
             notes += ("not of one wheel",)
         if score >= LISTED:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from soilbus.can.candump import Frame
     from soilbus.can.logs import Log
     from soilbus.config.model import Config
+    from soilbus.offline.columns import SignalTable
     from soilbus.sensors.survey import Survey
 
 
@@ -89,8 +90,9 @@ def run(args: argparse.Namespace) -> None:
         from soilbus.daemon.start import start_service
 
         config = configured(args)
-        if config.table is not None:
-            raise ConfigError(["[table]: a table of a test rig has no bus; replay and diagnose read it"])
+        if config.table is not None or config.columns is not None:
+            section = "[table]" if config.columns is None else "[columns]"
+            raise ConfigError([f"{section}: a table has no bus; replay and diagnose read it"])
         wait = args.wait or "NOTIFY_SOCKET" in os.environ
         try:
             service = start_service(config, wait)
@@ -124,7 +126,7 @@ def check(args: argparse.Namespace) -> None:
         raise ConfigError(faults)
 
 
-def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | None]:
+def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | SignalTable | None]:
     """What a recording, or the bus, says of the configuration, and the recording as far as it was read."""
     from soilbus.can.bus import BusError, heard_for
     from soilbus.can.dbc_files import load_databases

@@ -72,8 +72,10 @@ def _text(error: Any) -> str:
         return _unknown_key(error["loc"])
     if kind == "missing":
         return "missing"
+    if kind == "signal_name":
+        return f'{_shown(given)} is not "Message.Signal", the names of a message and of its signal in the DBC'
     if kind == "string_pattern_mismatch":
-        return _pattern(context.get("pattern", ""), given)
+        return f"{_shown(given)} is no name: 1 to 16 letters, digits, - or _"
     if kind == "literal_error":
         known = _choices(error["loc"])
         return f"{_shown(given)} is not one of {', '.join(map(str, known))}{did_you_mean(str(given), map(str, known))}"
@@ -138,12 +140,6 @@ _SENTENCES: Mapping[str, Callable[[Any, Mapping[str, Any]], str]] = {
     "bool_type": lambda given, _: f"{_shown(given)} is neither true nor false",
     "bool_parsing": lambda given, _: f"{_shown(given)} is neither true nor false",
 }
-
-
-def _pattern(pattern: str, given: Any) -> str:
-    if "." in pattern and r"\s" in pattern:
-        return f'{_shown(given)} is not "Message.Signal", the names of a message and of its signal in the DBC'
-    return f"{_shown(given)} is no name: 1 to 16 letters, digits, - or _"
 
 
 def _table_wanted(location: Sequence[Any], given: Any) -> str:

@@ -109,7 +109,7 @@ def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str =
     if left := open_lines(raw):
         raise ConfigError(f"{source}: {line}" for line in left)
     try:
-        return Config.model_validate({**raw, "folder": folder})
+        return Config.model_validate({**raw, "folder": folder}, context={"columns": "columns" in raw})
     except ValidationError as error:
         raise ConfigError(f"{source}: {line}" for line in fault_lines(raw, error)) from None
 

@@ -7,6 +7,7 @@ unit says so in its name.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +22,11 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     PrivateAttr,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from soilbus.grouping import grouped
 from soilbus.words import did_you_mean, shown
@@ -33,6 +36,7 @@ __all__ = [
     "Axle",
     "Bus",
     "Column",
+    "Columns",
     "Config",
     "ConfigError",
     "Dbc",
@@ -60,7 +64,16 @@ SHORT_BIN = 0.04
 `Estimator.bin`."""
 CONTROL_FREE_NAME = r"^[A-Za-z0-9_-]{1,16}$"
 Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
-SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
+
+
+def _signal_name(value: str, info: ValidationInfo) -> str:
+    """The same name, which without [columns] must be "Message.Signal"."""
+    if not (info.context or {}).get("columns") and not re.fullmatch(r"[^.\s]+\.[^.\s]+", value):
+        raise PydanticCustomError("signal_name", "no signal")
+    return value
+
+
+SignalName = Annotated[str, Field(min_length=1), AfterValidator(_signal_name)]
 
 
 class ConfigError(Exception):
@@ -165,7 +178,7 @@ class Signal(_Section):
     """Where a role's value comes from: "Message.Signal", or a table with more to say."""
 
     signal: SignalName
-    """`Message.Signal` of the DBC."""
+    """`Message.Signal` of the DBC; with [columns] the name of a column."""
     sign: Literal[1, -1] = 1
     """-1 for a sensor mounted the other way round."""
     at: Literal["wheel", "shaft"] | None = None
@@ -187,6 +200,8 @@ class Signal(_Section):
     """Of an axle's air springs together [m^2], where their pressure is mapped to its load: force over pressure."""
     unsprung_mass: NonNegativeFloat = 0.0
     """What the air springs do not carry [kg]: axle and wheels; added to the load that their pressure gives."""
+    unit: str | None = None
+    """Unit of a column's values, where its name does not end in one."""
 
     @model_validator(mode="after")
     def _unsprung_beside_springs(self) -> Signal:
@@ -482,6 +497,15 @@ class Column(_Section):
         if value == 0.0:
             raise ValueError("a factor of 0 leaves nothing of the column")
         return value
+
+
+class Columns(_Section):
+    """A table of decoded signals over time in place of a bus: CSV, Parquet or MF4; roles then name its columns."""
+
+    time: str = ""
+    """Column of the time: numbers, dates as ISO 8601 writes them, or dates of a Parquet file.  MF4 has its own."""
+    unit: Literal["s", "ms", "us", "ns"] | None = None
+    """Unit of numbers in it; by default the one that ends its name, else s."""
 
 
 class Table(_Section):
@@ -888,6 +912,7 @@ class Config(_Section):
     wheel: list[Wheel] = Field(default_factory=list, max_length=8)
     track: list[Track] = Field(default_factory=list, max_length=4)
     signals: Signals = Signals()
+    columns: Columns | None = None
     table: Table | None = None
     noise: NoiseOfChannels = NoiseOfChannels()
     soil: SoilPrior = SoilPrior()
@@ -958,6 +983,9 @@ class Config(_Section):
             raise ValueError(f"two {'tracks' if name in [t.name for t in self.track] else 'wheels'} are named {name}")
         if len(self.wheel) > 1 and self.vehicle is None:
             raise ValueError("several wheels need a [vehicle]")
+        if self.columns is not None and (self.dbc.input or self.table is not None):
+            other = "dbc.input" if self.dbc.input else "[table]"
+            raise ValueError(f"[columns] and {other} are two sources of the same signals: leave out one of the two")
         if self.table is not None and (self.vehicle is not None or len(self.wheel) != 1):
             raise ValueError("[table] is of a test rig: exactly one [[wheel]] and no [vehicle]")
         for w in self.wheel:

@@ -23,8 +23,8 @@ from soilbus.can.log_formats import is_csv_of_frames
 from soilbus.config.model import Config
 from soilbus.files import opened, plain_bytes, read_all, text_lines
 from soilbus.offline import dataset
+from soilbus.offline.columns import MISSING_CELLS, check_cells, separator_of
 from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
-from soilbus.offline.tables import MISSING_CELLS, check_cells, separator_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
@@ -76,12 +76,14 @@ def jobs_of(
             setups[path] = setup_of(config, name) if path is None else setup_of(load(path), path.name)
         return setups[path]
 
-    suffixes = TABLE_SUFFIXES if config.table is not None else LOG_SUFFIXES
+    suffixes: tuple[str, ...] = LOG_SUFFIXES
+    if config.table is not None or config.columns is not None:
+        suffixes = TABLE_SUFFIXES + (".mf4",) * (config.table is None)
     setup(None)
     jobs: dict[str, Job] = {}
     before = _logs_of_parts(parts)
     for argument in logs:
-        for entry in _entries(argument, config.table is not None):
+        for entry in _entries(argument, suffixes != LOG_SUFFIXES):
             own = entry.get("configuration")
             of_entry = partial(_job, entry, argument, setup(Path(own) if own else None))
             found = _files(entry["log"], suffixes)

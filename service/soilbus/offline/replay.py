@@ -25,6 +25,7 @@ from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.candump import Frame
 from soilbus.can.logs import Log, LogError, OtherBus, read_frames
 from soilbus.config.model import Config
+from soilbus.offline.columns import SignalTable, signal_table
 from soilbus.pipeline.estimator import Undecided, WindowEstimator
 from soilbus.pipeline.intake import Intake, WindowTask
 from soilbus.pipeline.pipeline import Pipeline
@@ -251,7 +252,7 @@ def channel_notes(config: Config, logs: Iterable[Path]) -> list[str]:
     """A line for each log whose first frames are not all of the configured channel; none for what cannot be read."""
     notes = []
     for path in logs:
-        if str(path) != "-":
+        if str(path) != "-" and config.columns is None:
             log = log_of(config, path)
             with suppress(LogError):
                 next(log.frames())
@@ -259,6 +260,8 @@ def channel_notes(config: Config, logs: Iterable[Path]) -> list[str]:
     return [note for note in notes if note]
 
 
-def log_of(config: Config, path: Path) -> Log:
-    """The log, of which the frames of the configured channel are read."""
+def log_of(config: Config, path: Path) -> Log | SignalTable:
+    """The log, of which the frames of the configured channel are read, or with [columns] the table of signals."""
+    if config.columns is not None:
+        return signal_table(config, path)
     return Log(path, config.log_channel or config.bus.channel, demanded=config.log_channel is not None)

@@ -22,7 +22,7 @@ from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.offline.played_bus import InlineExecutor, PlayedBus, PlayedClock
-from soilbus.offline.replay import LogError, read_frames
+from soilbus.offline.replay import LogError, log_of
 from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.pipeline.pipeline import Pipeline
 
@@ -49,7 +49,7 @@ def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
         The configuration cannot work, or a frame would come less often than its DBC says.
     """
     for log in logs:
-        yield from sent_beside(config, _readable(log))
+        yield from sent_beside(config, _readable(config, log))
 
 
 def sent_beside(config: Config, frames: Iterator[Frame]) -> Iterator[can.Message]:
@@ -68,9 +68,9 @@ def sent_beside(config: Config, frames: Iterator[Frame]) -> Iterator[can.Message
         yield from played.take_sent()
 
 
-def _readable(log: Path) -> Iterator[Frame]:
+def _readable(config: Config, log: Path) -> Iterator[Frame]:
     """The frames before the place where a log is damaged."""
     try:
-        yield from read_frames(log)
+        yield from log_of(config, log).frames()
     except LogError:
         return

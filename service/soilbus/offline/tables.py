@@ -8,15 +8,10 @@ Effects that depend on the true speed cannot be identified from such a table; `c
 
 from __future__ import annotations
 
-import csv
 import math
-import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
-from io import BytesIO
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,42 +22,27 @@ from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
 from soilbus.estimation.window import Rig, Window, window_of_samples
-from soilbus.files import LIMITS, opened, plain_bytes, read_all, text_lines
+from soilbus.offline.columns import Columns, TableError, check_columns, number, read_columns
 from soilbus.offline.recordings import Recordings, check_different
-from soilbus.offline.replay import LogError, log_names
+from soilbus.offline.replay import log_names
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask, column_means
 from soilbus.pipeline.result import WindowResult
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import for_wheel
 from soilbus.terra.vehicle import slip_ratio
-from soilbus.words import LONGEST_NAME, one_line, shown
-
-Columns = Mapping[str, Sequence[Any]]
+from soilbus.words import LONGEST_NAME, shown
 
 ROW_PERIOD = 1.0
 """Time [s] from one row to the next where the table has no times."""
 RIM_SPEED_RATIO = 100.0
 """Rim speed of the stand-in over the least speed at which slip is judged, so that no slip counts as a standstill."""
-MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "<na>", "null", "none"})
-"""Texts, in small letters, of a cell without a value."""
-SEPARATORS = ",;\t"
-"""Between the cells of a table; a spreadsheet writes semicolons or tabs where the comma is in numbers."""
-LEAST_CELL = 8
-"""Bytes of a cell in memory at least."""
-_DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
-_DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
-_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
 """Effects that depend on the true speed, which a table does not hold."""
 OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
 """Effects that depend on time."""
 OF_SEVERAL_WHEELS = frozenset({"multipass"})
 """Effects that need another wheel."""
-
-
-class TableError(LogError):
-    """A table cannot be used; the text says in one line where and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +77,7 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     TableError
         The file cannot be read, a column is missing, a cell is no number, or no row is left.
     """
-    return _runs(config, _columns(path, _needed(_table_of(config, str(path)))), str(path), name or path.name)
+    return _runs(config, read_columns(path, _needed(_table_of(config, str(path)))), str(path), name or path.name)
 
 
 def runs_of_columns(config: Config, columns: Columns, source: str) -> list[Run]:
@@ -112,7 +92,7 @@ def runs_of_columns(config: Config, columns: Columns, source: str) -> list[Run]:
     source
         What messages and the only run are called by.
     """
-    _check_columns(source, list(columns), _needed(_table_of(config, source)))
+    check_columns(source, list(columns), _needed(_table_of(config, source)))
     return _runs(config, columns, source, source)
 
 
@@ -267,114 +247,6 @@ def _needed(table: Table) -> list[str]:
     return list(dict.fromkeys([*mapped, *([table.run] if table.run else []), *table.where]))
 
 
-def _columns(path: Path, needed: Sequence[str]) -> Columns:
-    """The needed columns of a file."""
-    readers = {".csv": _csv, ".parquet": _parquet, ".pq": _parquet}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise TableError(f"{path}: not a table: {', '.join(readers)} can be read")
-    try:
-        return reader(path, needed)
-    except OSError as error:
-        raise TableError(f"{path}: {error.strerror or one_line(error, 100)}") from None
-
-
-def _csv(path: Path, needed: Sequence[str]) -> Columns:
-    rows, separator = _csv_rows(path, needed)
-    header = [name.strip() for name in rows[0]] if rows else []
-    _check_columns(path, header, needed)
-    for i, row in enumerate(rows[1:], 1):
-        if len(row) != len(header):
-            raise TableError(f"{path}: row {i} has {len(row)} cells under a header of {len(header)}")
-    places = {name: header.index(name) for name in needed}
-    columns = {name: [row[place] for row in rows[1:]] for name, place in places.items()}
-    return columns if separator == "," else _with_points(columns)
-
-
-def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
-    """Rows of a file with cells, and what separates these."""
-    try:
-        with opened(path) as stream:
-            lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
-            first = next((line for line in lines if line.strip()), "")
-            separator = separator_of(first, needed)
-            rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)
-            return [row for row in rows if row], separator
-    except (ValueError, csv.Error) as error:
-        raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
-
-
-def separator_of(header: str, names: Collection[str]) -> str:
-    """What separates a table's cells.
-
-    Parameters
-    ----------
-    header
-        Its first line.
-    names
-        Of columns that are looked for.
-
-    Returns
-    -------
-    The one of SEPARATORS by which most of the names are columns, of several the most frequent one.
-
-    Examples
-    --------
-    >>> separator_of("log;start, UTC, or none;vehicle", ["log", "vehicle"])
-    ';'
-    """
-
-    def found(separator: str) -> tuple[int, int]:
-        cells = {cell.strip() for row in csv.reader([header], delimiter=separator) for cell in row}
-        return len(cells & set(names)), header.count(separator)
-
-    return max(SEPARATORS, key=found)
-
-
-def _with_points(columns: dict[str, list[str]]) -> dict[str, list[str]]:
-    """The cells with a point in place of each decimal comma.
-
-    A comma is one where no number of the table has a point and some number cannot be one of thousands.
-    """
-    cells = {cell.strip() for column in columns.values() for cell in column}
-    commas = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)]
-    if any(map(_DECIMAL_POINT.fullmatch, cells)) or all(map(_THOUSANDS.fullmatch, commas)):
-        return columns
-    return {
-        name: [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in column]
-        for name, column in columns.items()
-    }
-
-
-def _parquet(path: Path, needed: Sequence[str]) -> Columns:
-    try:
-        arrow: Any = import_module("pyarrow")  # typed only in part
-        parquet: Any = import_module("pyarrow.parquet")
-    except ModuleNotFoundError:
-        raise TableError(f"{path}: a Parquet file needs the extra soilbus[tables]") from None
-    try:
-        with parquet.ParquetFile(path) as file:
-            _check_columns(path, file.schema_arrow.names, needed)
-            check_cells(file.metadata.num_rows * len(needed))
-            table = file.read(columns=list(needed))
-    except (arrow.ArrowException, ValueError) as error:
-        raise TableError(f"{path}: not a Parquet file that can be read ({one_line(error, 100)})") from None
-    return {name: table.column(name).to_pylist() for name in needed}
-
-
-def check_cells(cells: int) -> None:
-    """Raise ValueError where a Parquet file has too many cells for the memory, which its size does not show."""
-    if cells > LIMITS.whole // LEAST_CELL:
-        raise ValueError(f"{cells} cells are too many")
-
-
-def _check_columns(source: Path | str, header: Sequence[str], needed: Sequence[str]) -> None:
-    if missing := [name for name in needed if name not in header]:
-        raise TableError(f"{source}: no column {', '.join(missing)}; it has {', '.join(header) or 'none'}")
-    if twice := [name for name in needed if header.count(name) > 1]:
-        raise TableError(f"{source}: two columns are named {', '.join(twice)}")
-
-
 def _chosen(columns: Columns, where: Mapping[str, Any]) -> list[int]:
     """Numbers of the rows that `where` asks for."""
     n = len(next(iter(columns.values())))
@@ -393,16 +265,8 @@ def _equal(cell: Any, wanted: Any) -> bool:
 def _numbers(source: str, columns: Columns, column: Column, rows: Sequence[int]) -> Array:
     """A column's numbers in SI at these rows, nan where missing."""
     cells = columns[column.column]
-    return np.array([_number(source, column.column, row, cells[row]) for row in rows]) * column.factor
-
-
-def _number(source: str, column: str, row: int, cell: Any) -> float:
-    if cell is None or str(cell).strip().lower() in MISSING_CELLS:
-        return math.nan
-    try:
-        value = math.inf if isinstance(cell, bool) else float(cell)
-    except (TypeError, ValueError):
-        value = math.inf
-    if not math.isfinite(value):
-        raise TableError(f"{source}: row {row + 1}, column {column}: {cell!r} is not a number")
-    return value
+    values = np.array([number(cells[row]) for row in rows])
+    for row, value in zip(rows, values.tolist(), strict=True):
+        if math.isinf(value):
+            raise TableError(f"{source}: row {row + 1}, column {column.column}: {cells[row]!r} is not a number")
+    return np.asarray(values * column.factor)

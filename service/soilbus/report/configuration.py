@@ -22,6 +22,7 @@ from soilbus.config.model import Config, Form, Signal, Table
 from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
 from soilbus.estimation.window import VEHICLE_QUANTITIES, NoiseTable, made_window
+from soilbus.offline.columns import SignalTable
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.modelled_drive import modelled_drive
@@ -158,17 +159,18 @@ def _measured(config: Config) -> Iterator[str]:
             yield quantity
 
 
-def log_report(log: Log, found: Survey) -> str:
+def log_report(log: Log | SignalTable, found: Survey) -> str:
     """What a log is, how long, of which channels, and which of the mapped messages it holds."""
     mapped = dict.fromkeys(seen.channel.message for seen in found.seen)
     heard = {seen.channel.message for seen in found.seen if seen.count or seen.refused}
     missing = [name for name in mapped if name not in heard]
     channels = ", ".join(f"{name} {n}" for name, n in sorted(log.channels.items()) if name)
-    lines = [
-        f"{log.name}: {log.kind}, {log.span:.1f} s, {log.channels.total()} frames",
-        f"channels: {channels or 'not named'}" + (f"; read: {log.chosen}" if log.left_out else ""),
-        f"mapped messages: {len(heard)} of {len(mapped)}" + (f"; not in it: {', '.join(missing)}" if missing else ""),
-    ]
+    what, parts = ("values", "columns") if isinstance(log, SignalTable) else ("frames", "messages")
+    lines = [f"{log.name}: {log.kind}, {log.span:.1f} s, {log.channels.total()} {what}"]
+    if isinstance(log, Log):
+        lines.append(f"channels: {channels or 'not named'}" + (f"; read: {log.chosen}" if log.left_out else ""))
+    absent = f"; not in it: {', '.join(missing)}" if missing else ""
+    lines.append(f"mapped {parts}: {len(heard)} of {len(mapped)}{absent}")
     return "\n" + "\n".join(lines) + "\n"
 
 
@@ -334,7 +336,7 @@ def effect_lines(config: Config) -> list[str]:
 def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool) -> tuple[str, ...]:
     message = database.get_message_by_name(channel.message)
     signal = message.get_signal_by_name(channel.signal)
-    status = "SI assumed: the DBC gives no unit" if unit_assumed else "ok"
+    status = "SI assumed: no unit given" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
     if channel.delay:
@@ -344,7 +346,7 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
     every = f"{message.cycle_time} ms" if message.cycle_time else "not given"
     return (
         channel.name,
-        f"{channel.message}.{channel.signal}",
+        channel.path,
         signal.unit or "-",
         f"{channel.factor:g}" + (f", + {channel.offset:g}" if channel.offset else ""),
         f"{channel.low:.4g} .. {channel.high:.4g}",

@@ -29,7 +29,7 @@ from soilbus.can.admission import Admission, Counts
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.doubts import MEANING
-from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of
+from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of, found_signal
 from soilbus.can.units import SI, unit_of
 from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
@@ -284,8 +284,7 @@ def _rotation(text: str | None) -> bool:
 
 
 def _is_in_metres(signal: Signal, database: Database) -> bool:
-    name, _, own = signal.signal.partition(".")
-    unit = unit_of(database.get_message_by_name(name).get_signal_by_name(own).unit)
+    unit = unit_of(found_signal(database, signal.signal)[1].unit)
     return unit is not None and unit.dimension == "speed"
 
 
@@ -404,7 +403,7 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
     for reason in sorted(said | ({Reason.SECOND_SENDER} & seen.refused.keys())):
         n, unit = seen.refused[reason], SI.get(_dimension(channel), "")
         why = _REFUSAL.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
-        text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
+        text = f"{key}: {n} of {refused + seen.count} values of {channel.path} do not count: {why}"
         yield Finding(text, share > 4.0 * LIMITS.refused, (channel.name,) if share > 4.0 * LIMITS.refused else ())
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
         cycle = 0 if _is_of_a_page(message, channel.signal) else message.cycle_time
@@ -449,8 +448,8 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
             yield Finding(
                 f"{s.channel.key}: jumps by {typical:.3g} {unit} from one value to the next, {typical / sd:.0f} times"
-                f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.message}."
-                f"{s.channel.signal} right in the DBC?",
+                f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.path}"
+                " right in the DBC?",
                 True,
                 (name,),
             )

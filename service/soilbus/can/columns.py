@@ -1,0 +1,85 @@
+"""Columns of a table of decoded signals as messages: each column is one message, whose one signal is a 64-bit float.
+
+    column "wheel FL [rpm]"  ->  message of that name, unit rpm  ->  a frame for each cell that holds something
+
+So a table goes through admission, bins and comparisons just as a log of frames does.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from cantools.database.can import Database, Message, Signal
+from cantools.database.conversion import BaseConversion
+
+from soilbus.can.channels import WHOLE
+from soilbus.can.units import unit_of
+from soilbus.config.model import Config
+
+_IN_BRACKETS = re.compile(r".*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+_BEHIND = re.compile(r".*?[_ /,]([^\s_,]+)\s*")
+LETTERS = frozenset({"N", "m", "g"})
+"""Units of one letter that may end a column's name ("draft_N"); other single letters number or place a sensor."""
+
+
+def unit_in(column: str) -> str:
+    """The unit with which a column's name ends, in brackets or as its last word; "" without one.
+
+    Examples
+    --------
+    >>> unit_in("wheel FL [1/min]"), unit_in("draft_kN"), unit_in("torque_R"), unit_in("Zugkraft (N)")
+    ('1/min', 'kN', '', 'N')
+    """
+    if found := _IN_BRACKETS.fullmatch(column):
+        return found[1]
+    found = _BEHIND.fullmatch(column)
+    while found is not None:
+        if (len(found[1]) > 1 or found[1] in LETTERS) and _is_unit(found[1]):
+            return found[1]
+        found = _BEHIND.fullmatch(found[1])
+    return ""
+
+
+def _is_unit(text: str) -> bool:
+    try:
+        return unit_of(text) is not None
+    except ValueError:
+        return False
+
+
+def column_database(units: Mapping[str, str]) -> Database:
+    """The columns as messages, each numbered by its place.
+
+    Parameters
+    ----------
+    units
+        Unit of each column by its name; "" where it is not known.
+    """
+    database = Database(strict=False)
+    conversion = BaseConversion.factory(scale=1, offset=0, is_float=True)
+    for number, (column, unit) in enumerate(units.items()):
+        signal = Signal(WHOLE, 0, 64, "little_endian", True, conversion=conversion, unit=unit or None)
+        database.messages.append(
+            Message(number, column, 8, [signal], is_extended_frame=number >= 1 << 11, strict=False)
+        )
+    database.refresh()
+    return database
+
+
+def mapped_columns(config: Config) -> dict[str, str]:
+    """Unit of each column that the configuration maps, by its name."""
+    mapped = _signals(config.model_dump(exclude={"columns", "table", "folder"}))
+    return {one["signal"]: one["unit"] if one["unit"] is not None else unit_in(one["signal"]) for one in mapped}
+
+
+def _signals(section: Any) -> Iterator[Mapping[str, Any]]:
+    """All tables that name a signal."""
+    if isinstance(section, Mapping):
+        if isinstance(section.get("signal"), str):
+            yield section
+        section = list(section.values())
+    if isinstance(section, list):
+        for part in section:
+            yield from _signals(part)
