@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -21,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from cantools.database.can import Database, Message, Signal
 
-from soilbus.can.channels import path_of
+from soilbus.can.channels import WHOLE, path_of
 from soilbus.can.j1939 import pgn_of
 from soilbus.can.units import Unit, unit_of
 
@@ -50,6 +51,10 @@ MARGIN = 0.3
 """Score by which it must beat the next candidate: less than one word."""
 LISTED = 0.25
 """Score from which a candidate is worth a line."""
+SOLE = 0.5
+"""Score from which the only candidate of a slot is taken: half of what an asserted match needs."""
+ONLY = "the only candidate"
+"""Note on a match that was taken because there is no other."""
 IN_MESSAGE, IN_COMMENT = 0.7, 0.5
 """Share of a word's weight where it stands in the message's name or in the comment, not in the signal's own name."""
 
@@ -110,6 +115,7 @@ _GROUPS: Mapping[int, frozenset[str]] = {
 }  # fmt: skip
 """What the standards say of a parameter group, with any names of its signals."""
 _ASKED = frozenset({"request", "least", "rated"})
+_HITCH = frozenset({"hitch", "draft", "pull", "link"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
 _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozenset[str]]] = {
     "torque": (
@@ -202,6 +208,13 @@ class Candidate:
     """SI value of one unit of the DBC; 1 without a unit."""
     dimension: str
     notes: tuple[str, ...] = ()
+    absent: bool = False
+    """Whether a log has no value of it."""
+
+    @property
+    def needs_number(self) -> bool:
+        """Whether it is a torque only with a number that the DBC does not have."""
+        return any(note.startswith("with ") for note in self.notes)
 
     @property
     def path(self) -> str:
@@ -273,7 +286,24 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
             out.rivals.extend(c for c in rivals if c.score >= ASSERTED)
         elif of_slot:
             out.open[slot] = of_slot
+    _take_sole(out)
     return out
+
+
+def _take_sole(out: Assignment) -> None:
+    """Assert what is the one candidate of its slot and of no other, where its place and its torque are known."""
+    uses = Counter(c.path for cs in out.open.values() for c in cs)
+    for slot, (first, *others) in list(out.open.items()):
+        is_whole = slot.role not in WHEEL_ONLY | WHEEL_AND_AXLE or slot.place
+        if (
+            is_whole
+            and not others
+            and uses[first.path] == 1
+            and first.score >= SOLE
+            and not first.absent | first.needs_number
+        ):
+            out.asserted[slot] = first.changed(0.0, ONLY)
+            del out.open[slot]
 
 
 def dimensions_of(role: str) -> tuple[str, ...]:
@@ -305,14 +335,17 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str]) -> list[
     except ValueError:
         return _indirect(message, signal, place)
     group = pgn_of(message.frame_id) if message.is_extended_frame else 0
-    own, around = _words(signal.name), _words(message.name) | _GROUPS.get(group, frozenset())
+    own, around = _words(_own_name(message, signal)), _words(message.name) | _GROUPS.get(group, frozenset())
+    if signal.name == WHOLE:
+        around = own
     found = []
     for role, (dimensions, *_) in _ROLES.items():
         if unit is not None and unit.dimension not in dimensions:
             continue
         if signal.length < FEWEST_BITS and dimensions != ("",):
             continue
-        score = _score(role, own, around, _words(comment), unit) + _by_range(role, signal, unit, own)
+        at_wheel = place in WHEELS
+        score = _score(role, own, around, _words(comment), unit, at_wheel) + _by_range(role, signal, unit, own)
         slot = Slot(role, _place_of(role, place))
         notes: tuple[str, ...] = ("no unit: SI assumed",) if unit is None and dimensions != ("",) else ()
         if role in WHEEL_ONLY and slot.place not in WHEELS:
@@ -330,7 +363,7 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str]) -> list[
 
 def _indirect(message: Message, signal: Signal, place: str) -> list[Candidate]:
     """A percentage or a current, which is a torque with a number that the DBC does not have: never asserted."""
-    own, around, unit = _words(signal.name), _words(message.name), (signal.unit or "").strip()
+    own, around, unit = _words(_own_name(message, signal)), _words(message.name), (signal.unit or "").strip()
     if own & _ASKED or "limit" in own:
         return []
     note = ""
@@ -342,9 +375,24 @@ def _indirect(message: Message, signal: Signal, place: str) -> list[Candidate]:
     return [Candidate(slot, message.name, signal.name, score, unit, 1.0, "torque", (note,))] if note else []
 
 
-def _score(role: str, own: frozenset[str], around: frozenset[str], comment: frozenset[str], unit: Unit | None) -> float:
+def _own_name(message: Message, signal: Signal) -> str:
+    """The name of a signal, or of a column without its unit."""
+    return message.name.removesuffix(f"[{signal.unit}]") if signal.name == WHOLE else signal.name
+
+
+def _score(
+    role: str,
+    own: frozenset[str],
+    around: frozenset[str],
+    comment: frozenset[str],
+    unit: Unit | None,
+    at_wheel: bool,
+) -> float:
     dimensions, base, weights, against = _ROLES[role]
-    is_bare = not own - {"front", "rear"}  # a name that only says where: the message says what
+    if at_wheel:
+        against = against - _HITCH  # a load pin is in a wheel's hub, too
+        around = around | {"wheel"} if role == "speed" else around
+    is_bare = not own - {"front", "rear", "speed"}  # it only says where, or how fast: the message says what
     score = base if unit is not None or dimensions == ("",) else -_NO_UNIT
     for word, weight in weights.items():
         share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
@@ -372,7 +420,10 @@ def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str])
         return -1.0 if extent > 1.6 or {"steering", "wheel"} <= own else 0.0 if extent > 0.0 else -0.3
     if role in ("latitude", "longitude"):
         least = (math.pi / 2.0 if role == "latitude" else math.pi) - 1e-6
-        is_part = float(signal.scale) * (unit.factor if unit else 1.0) > COARSEST_POSITION  # minutes stand elsewhere
+        coarse = not signal.conversion.is_float
+        is_part = (
+            coarse and float(signal.scale) * (unit.factor if unit else 1.0) > COARSEST_POSITION
+        )  # minutes stand elsewhere
         return -1.0 if extent < least or low >= 0.0 or is_part else 0.0
     if role in ("pitch", "roll"):
         return -1.0 if extent > 2.0 * math.pi - 0.1 or low >= 0.0 else 0.0  # a course

@@ -143,9 +143,16 @@ def command_line() -> argparse.ArgumentParser:
         help="keep the dashboard's last state: the driver's page, and the engineer's in OUT-engineer.svg",
     )  # fmt: skip
 
-    sub = command("init", "propose a configuration from the vehicle's DBC, and from a log of a drive", "")
-    sub.add_argument(
-        "--dbc", action="append", type=Path, required=True, metavar="FILE", help="of the vehicle; repeat it for more"
+    sub = command(
+        "init", "propose a configuration from the vehicle's DBC and a log of a drive, or from a table of signals", ""
+    )
+    source = sub.add_mutually_exclusive_group(required=True)
+    source.add_argument("--dbc", action="append", type=Path, metavar="FILE", help="of the vehicle; repeat it for more")
+    source.add_argument(
+        "--table",
+        type=Path,
+        metavar="LOG",
+        help="in place of DBC and log: decoded signals over time (CSV, Parquet, MF4)",
     )
     sub.add_argument("--log", type=Path, metavar="LOG", help="a drive with varied load, to see what each signal does")
     channel(sub)
@@ -164,6 +171,7 @@ def command_line() -> argparse.ArgumentParser:
         "--live", type=between(1.0, 3600.0), metavar="SECONDS", help="and with SECONDS of the configured bus"
     )
     channel(sub)
+    sub.add_argument("--settings", action="store_true", help="list every setting in force, defaults included")
 
     sub = command("replay", "the service's own pipeline over recorded logs")
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recording; - for stdin")

@@ -21,6 +21,8 @@ from soilbus.files import write_text
 from soilbus.process import ENDING, say
 
 if TYPE_CHECKING:
+    from cantools.database.can import Database
+
     from soilbus.can.candump import Frame
     from soilbus.can.logs import Log
     from soilbus.config.model import Config
@@ -52,15 +54,25 @@ def init(args: argparse.Namespace) -> None:
     if not to_stdout and args.out.exists() and not args.force:
         raise WorkError(f"{args.out} is there already; --force replaces it")
     check_outputs(None if to_stdout else args.out)
-    dbcs = [located(Path(), str(path)) for path in args.dbc]
+    if args.table is not None and (args.log is not None or args.channel is not None):
+        raise ConfigError(["--table has the drive in it: leave out --log and --channel"])
+    dbcs = [located(Path(), str(path)) for path in args.dbc or ()]
+    time, recorded = "", args.table or args.log
+    log: Log | SignalTable | None = None
     try:
-        database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in dbcs]}}))
+        if args.table is not None:
+            time, database, log = _of_table(args.table)
+        else:
+            database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in dbcs]}}))
+            if args.log is not None:
+                log = Log(args.log, args.channel or "", demanded=True)
     except ConfigError as error:
         raise ConfigError(fault.replace("dbc.input", "--dbc") for fault in error.faults) from None
+    except LogError as error:
+        raise WorkError(str(error)) from None
     found, facts = candidates(database), Facts()
-    if args.log is not None:
+    if log is not None:
         try:
-            log = Log(args.log, args.channel or "", demanded=True)
             with progress("init") as step:
                 recording = recording_of(found, database, _counted(log.frames(), step))
         except LogError as error:
@@ -68,16 +80,28 @@ def init(args: argparse.Namespace) -> None:
         if log.note:
             say(log.note)
         if not recording.columns:
-            raise WorkError(f"{args.log}: no frame of a signal in {', '.join(map(str, args.dbc))} that could be mapped")
+            source = f" in {', '.join(map(str, args.dbc))}" if args.dbc else ""
+            raise WorkError(f"{recorded}: no frame of a signal{source} that could be mapped")
         found = weighed(found, recording)
         facts = facts_of(assigned(found), recording)
     files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
-    with_log = [] if args.log is None else ["--log", str(args.log)]
-    words = ["soilbus", "init", *(word for path in args.dbc for word in ("--dbc", str(path))), *with_log]
-    made = proposal(database, assigned(found), facts, files, shlex.join(words))
+    with_log = [] if recorded is None else ["--log", str(recorded)]
+    of = ["--table", str(args.table)] if args.table else [w for p in args.dbc for w in ("--dbc", str(p))] + with_log
+    made = proposal(database, assigned(found), facts, files, shlex.join(["soilbus", "init", *of]), time)
     write_text(args.out, made.text)
     then = shlex.join(["soilbus", "check", "--config", "soilbus.toml" if to_stdout else str(args.out), *with_log])
     say(f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then {then}')
+
+
+def _of_table(path: Path) -> tuple[str, Database, SignalTable]:
+    """The column of times of a table, its columns with numbers as messages, and the table."""
+    from soilbus.can.columns import column_database, unit_in
+    from soilbus.config.model import Columns
+    from soilbus.offline.columns import SignalTable, read_samples, time_column
+
+    time = Columns(time=time_column(path))
+    units = {name: column.unit or unit_in(name) for name, column in read_samples(path, time).items()}
+    return time.time, column_database(units), SignalTable(path, time, list(units))
 
 
 def run(args: argparse.Namespace) -> None:

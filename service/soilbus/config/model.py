@@ -942,6 +942,32 @@ class Config(_Section):
         defaults = {"wheelbase": length, "steering": "skid", "cg_ahead_of_rear_axle": length / 2.0}
         return {**value, "vehicle": defaults | dict(value["vehicle"])}
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_axle_of_a_name(cls, value: Any) -> Any:
+        """[[axle]]s of one name that share no other key as one: a motor, and a load cell that stands apart."""
+        axles = value.get("axle") if isinstance(value, Mapping) else None
+        if not isinstance(axles, list):
+            return value
+        merged: list[Any] = []
+        for axle in axles:
+            known = next(
+                (
+                    a
+                    for a in merged
+                    if isinstance(a, Mapping)
+                    and isinstance(axle, Mapping)
+                    and a.get("name") == axle.get("name")
+                    and a.keys() & axle.keys() == {"name"}
+                ),
+                None,
+            )
+            if known is None:
+                merged.append(axle)
+            else:
+                merged[merged.index(known)] = {**known, **axle}
+        return {**value, "axle": merged}
+
     @model_validator(mode="after")
     def _tracks_as_wheels(self) -> Config:
         """`wheel` holds the tracks, too, behind the wheels: all that runs on the ground."""

@@ -282,7 +282,9 @@ def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = Non
     if kind_of(path) == ".mf4":
         return _mf4(path, names)
     if not time.time:
-        raise TableError(f"{path}: columns.time does not say which of its columns is the time")
+        raise TableError(
+            f"{path}: which column is the time? None is called t, time, timestamp or Zeit; columns.time says it"
+        )
     cells = read_columns(path, None if names is None else list(dict.fromkeys([time.time, *names])))
     if time.time not in cells:
         raise TableError(f"{path}: no column {time.time}{did_you_mean(time.time, cells)}")

@@ -18,13 +18,25 @@ from cantools.database.can import Database, Message, Signal
 from tomlkit import TOMLDocument
 from tomlkit.items import Table
 
+from soilbus.can.channels import WHOLE
+from soilbus.can.columns import unit_in
 from soilbus.can.mapping import VEHICLE_ROLES
-from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, described, dimensions_of, is_word_in
+from soilbus.can.role_matching import (
+    AXLES,
+    ONLY,
+    WHEELS,
+    Assignment,
+    Candidate,
+    Slot,
+    described,
+    dimensions_of,
+    is_word_in,
+)
 from soilbus.can.validity import vouching_codes
 from soilbus.config.edit import toml_text
 from soilbus.config.file import OPEN
 from soilbus.grouping import grouped
-from soilbus.sensors.role_evidence import Facts, is_absent
+from soilbus.sensors.role_evidence import Facts
 from soilbus.words import shown
 
 __all__ = ["Proposal", "proposal"]
@@ -125,7 +137,14 @@ class _Draft:
         if valid is not None and valid.choices and not vouching_codes(valid):
             names = ", ".join(f'{code} "{name}"' for code, name in sorted(valid.choices.items()))
             remarks.append(f"which of {names} vouch for it?")
-        remarks += ["no unit in the DBC: SI assumed"] if not c.unit and c.dimension else []
+        remarks += [note for note in c.notes if note == ONLY]
+        if c.dimension and c.signal == WHOLE and not c.unit:
+            value["unit"] = OPEN
+            remarks += [note for note in c.notes if note.endswith("SI")]  # its range
+        elif c.signal == WHOLE and c.unit != unit_in(c.message):
+            value["unit"] = c.unit
+        elif not c.unit and c.dimension:
+            remarks.append("no unit in the DBC: SI assumed")
         self.put(key, value if len(value) > 1 else c.path, "; ".join(remarks))
 
 
@@ -134,7 +153,9 @@ def _open_values(value: Any) -> int:
     return sum(map(_open_values, value.values())) if isinstance(value, Mapping) else int(value == OPEN)
 
 
-def proposal(database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str) -> Proposal:
+def proposal(
+    database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str, time: str = ""
+) -> Proposal:
     """A configuration of four wheels from what was matched.
 
     Parameters
@@ -144,20 +165,27 @@ def proposal(database: Database, assignment: Assignment, facts: Facts, files: Se
     assignment, facts
         Signals by slot, and what a recording says; `Facts()` without one.
     files
-        DBC files as the configuration shall name them.
+        DBC files as the configuration shall name them; none for a table of signals over time.
     origin
         The command, for the first line.
+    time
+        Column of the times of a table; "" where it has its own.
     """
     draft = _Draft(database, _one_layout(assignment), facts)
     draft.note(
         f"Proposed by `{origin}`: read each line.",
         f'"{OPEN}" is open: put the value in its place. `soilbus check` names every line that is still open.',
     )
-    draft.section("bus")
-    draft.put("interface", "socketcan")
-    draft.put("channel", "can0")
-    draft.section("dbc")
-    draft.put("input", list(files))
+    if files:
+        draft.section("bus")
+        draft.put("interface", "socketcan")
+        draft.put("channel", "can0")
+        draft.section("dbc")
+        draft.put("input", list(files))
+    else:
+        draft.section("columns")
+        if time:
+            draft.put("time", time)
     _put_vehicle(draft)
     layout = _layout_of(draft)
     draft.axles = layout.axles
@@ -241,8 +269,7 @@ def _put_axle(draft: _Draft, axle: str) -> None:
     if axle:
         draft.put("name", axle)
     else:
-        above = "; where that stands above, move its load here" if len(draft.axles) > 1 else ""
-        draft.put_open("name", f'axle that this motor drives: "front", "rear" or "both"{above}')
+        draft.put_open("name", 'axle that this motor drives: "front", "rear" or "both"')
     if axle == "" or (axle == draft.facts.axle and not draft.matched("torque", axle)):
         place = ""  # the motor of no name
         if axle:
@@ -323,7 +350,7 @@ def _put_limit(draft: _Draft, torque: Candidate, at: str) -> None:
 
 def _beside(draft: _Draft, torque: Candidate, c: Candidate | None) -> Candidate | None:
     """A signal that belongs to a torque: of its place or, where no name says a place, of its message or sender."""
-    if c is None or torque.slot.place or c.message == torque.message:
+    if c is None or torque.slot.place or c.message == torque.message or c.signal == WHOLE:
         return c
     one, other = (draft.database.get_message_by_name(name).senders for name in (c.message, torque.message))
     return c if set(one) & set(other) - {"Vector__XXX"} else None
@@ -361,7 +388,7 @@ def _put_signals(draft: _Draft) -> None:
 
 def _put_rest(draft: _Draft) -> None:
     """Limits without load cells, noise, and candidates that no line names."""
-    if not all(draft.matched("load", wheel) for wheel in WHEELS):
+    if not any(all(draft.matched("load", place) for place in places) for places in (WHEELS, AXLES[:2])):
         draft.section("estimator")
         draft.put(
             "max_bearing_std",
@@ -374,16 +401,16 @@ def _put_rest(draft: _Draft) -> None:
     known = draft.assignment
     found = [*(c for cs in known.open.values() for c in cs), *known.asserted.values(), *known.rivals]
     rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
-    if perhaps := grouped((c for c in rest.values() if not is_absent(c)), lambda c: c.slot.role):
+    if perhaps := grouped((c for c in rest.values() if not c.absent), lambda c: c.slot.role):
         draft.note("Not used, but perhaps:", *(f"  {role}: {_listed(cs)}" for role, cs in perhaps.items()), apart=True)
     unnamed: dict[str, list[Candidate]] = {}
     for c in known.unnamed:
-        if c.path not in draft.used | draft.named and not is_absent(c):
+        if c.path not in draft.used | draft.named and not c.absent:
             unnamed.setdefault(c.dimension, []).append(c)
     if unnamed:
         lines = (f"  {dimension}: {_listed(cs)}" for dimension, cs in unnamed.items())
         draft.note("Of no role that a name says; by their units:", *lines, apart=True)
-    if absent := sorted(path for path, c in rest.items() if is_absent(c)):
+    if absent := sorted(path for path, c in rest.items() if c.absent):
         lines = (f"  {line}" for line in textwrap.wrap(", ".join(absent), 116, break_long_words=False))
         draft.note("In the DBC, but never in the log:", *lines, apart=True)
 

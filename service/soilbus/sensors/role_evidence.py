@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from cantools.database.can import Database
@@ -25,7 +25,7 @@ from soilbus.can.role_matching import ASSERTED, AXLES, WHEELS, Assignment, Candi
 from soilbus.can.units import STANDARD_GRAVITY
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 
-__all__ = ["Facts", "Recording", "facts_of", "is_absent", "recording_of", "weighed"]
+__all__ = ["Facts", "Recording", "facts_of", "recording_of", "weighed"]
 
 BIN = 0.2
 """Time [s] over which samples are averaged before they are compared: a few frames of each sensor."""
@@ -121,7 +121,7 @@ def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]
         if c.path not in recording.columns:
             refused = recording.refused[c.path]
             what = f"{NEVER_AVAILABLE} in {refused} frames" if refused else NO_FRAME
-            out.append(c.changed(-REFUSED if refused else -ABSENT, what))
+            out.append(replace(c.changed(-REFUSED if refused else -ABSENT, what), absent=True))
             continue
         t, value = recording.columns[c.path]
         rate = f"{(len(t) - 1) / max(float(t[-1] - t[0]), 1e-9):.3g}/s" if len(t) > 1 else "once"
@@ -129,11 +129,6 @@ def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]
         c = c.changed(0.0, f"{rate}, {low:.4g} all along" if low == high else f"{rate}, {low:.4g} to {high:.4g} SI")
         out.append(_as_ground_speed(c, recording, turning) if c.slot.role == "ground_speed" else c)
     return out
-
-
-def is_absent(c: Candidate) -> bool:
-    """Whether the recording has no value of a candidate."""
-    return any(note.startswith((NO_FRAME, NEVER_AVAILABLE)) for note in c.notes)
 
 
 def facts_of(assignment: Assignment, recording: Recording) -> Facts:
