@@ -242,6 +242,7 @@ def test_german_messages_in_the_plural_say_what_their_signals_are(tmp_path, caps
     assert found == {
         "wheel.FL.torque": "Antrieb_VL.Drehmoment", "wheel.FR.torque": "Antrieb_VR.Drehmoment",
         "wheel.FL.speed": "Raddrehzahlen.Rad_VL", "wheel.FR.speed": "Raddrehzahlen.Rad_VR",
+        "wheel.FL.motor_speed": "Antrieb_VL.Drehzahl", "wheel.FR.motor_speed": "Antrieb_VR.Drehzahl",
         "wheel.FL.load": "Radlasten.VL", "wheel.FR.load": "Radlasten.VR", "axle.rear.load": "Achslasten.Hinten",
     }  # fmt: skip
 

@@ -131,23 +131,31 @@ def run(args: argparse.Namespace) -> None:
 def check(args: argparse.Namespace) -> None:
     """`soilbus check`: the configuration, and with a recording or a live bus the data beside it."""
     from soilbus.config.model import ConfigError
-    from soilbus.report.configuration import configuration_report, configuration_warnings, log_report, survey_report
+    from soilbus.report.configuration import (
+        configuration_report,
+        configuration_warnings,
+        defaults_text,
+        log_report,
+        survey_report,
+    )
 
     config = configured(args)
-    print(configuration_report(config), end="")
+    of_configuration = configuration_report(config)
     warnings, faults = configuration_warnings(config), list[str]()
     if args.log is not None or args.live is not None:
         found, log = _surveyed(args, config)
-        if log is not None:
-            print(log_report(log, found), end="")
-            warnings += [log.note] * bool(log.note)
-        print(survey_report(found), end="")
-        warnings += found.warnings
         faults = found.faults
+        for line in faults:
+            say(line)
+        print("" if log is None else log_report(log, found), survey_report(found), sep="")
+        warnings += ([log.note] if log is not None and log.note else []) + found.warnings
+    print(of_configuration, end="")
+    if args.settings:
+        print("\nSettings in force (defaults included):", defaults_text(config), sep="\n")
     for line in warnings:
         say(f"warning: {line}")
     if faults:
-        raise ConfigError(faults)
+        raise ConfigError([])  # each is said above, before the tables
 
 
 def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | SignalTable | None]:

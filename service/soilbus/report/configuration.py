@@ -1,7 +1,7 @@
-"""What `soilbus check` prints: mapped signals, what these sensors determine of the soil, settings in force.
+"""What `soilbus check` prints: received values beside the configuration, mapped signals, what these sensors determine.
 
-Three tables: one row for each mapped signal (unit, factor, range, cycle time), one line for each soil parameter, one
-line for each setting. With a recording a fourth one compares each signal with what was received.
+With a recording its table stands first: what was received of each signal. Then one row for each mapped signal (unit,
+factor, range, cycle time), one line for each soil parameter and, on demand, one line for each setting.
 """
 
 from __future__ import annotations
@@ -171,14 +171,14 @@ def log_report(log: Log | SignalTable, found: Survey) -> str:
         lines.append(f"channels: {channels or 'not named'}" + (f"; read: {log.chosen}" if log.left_out else ""))
     absent = f"; not in it: {', '.join(missing)}" if missing else ""
     lines.append(f"mapped {parts}: {len(heard)} of {len(mapped)}{absent}")
-    return "\n" + "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def survey_report(found: Survey) -> str:
     """Received values of every mapped signal beside the configuration, and what the recording cannot show."""
     rows = [_heard_row(seen, found) for seen in found.seen]
     head = ("role", "values", "every", "from", "median", "to", "unit", "refused", "beside the configuration")
-    return "\n" + table(head, rows) + text_of(f"cannot be decided: {line}" for line in found.open)
+    return "\n" + table(head, rows) + text_of(f"not checkable from this log: {line}" for line in found.open)
 
 
 def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
@@ -206,7 +206,6 @@ def _report(config: Config, parts: list[str]) -> str:
     if effects:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
     parts.append("\nWhat is assumed of the soil before any data:\n" + prior_text(config) + "\n")
-    parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
     return "\n".join(parts[:1]) + "\nWhat these sensors determine of the soil:\n" + "".join(parts[1:])
 
 
