@@ -235,7 +235,7 @@ def test_a_caution_that_only_waits_for_a_second_window_asks_for_no_less_draft(de
         desk.send("SoilbusStatus", State="valid", Reason="none", Window=3)
         desk.send("Traversability", State="caution", LimitingCause="traction", Probability=probability)
         said[probability] = desk.dashboard.verdict().todo
-    assert said == {0.94: "Less draft, more load", 0.97: "Go slowly, still measuring"}
+    assert said == {0.94: "Less draft, more load", 0.97: "Go slowly, caution is held"}
 
 
 def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():

@@ -44,7 +44,12 @@ ADVICE = {
 }
 """What to do by state and limiting cause, in at most five words."""
 WARNED_ADVICE = "Stop, lift, add no torque"
+MOVING_ADVICE = "Lift, add no torque"
+"""The same while the state still lets the vehicle go on: a stop would contradict it."""
+HELD = "Go slowly, caution is held"
+ABOVE_BEST = "Keep going, slip above best"
 GONE_ADVICE = "Rely on your own judgement"
+FIRST_IS_DUE = "the first window is due"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
     "go": ("#000000", "#00d700"),
@@ -226,14 +231,18 @@ class Dashboard:
             left = known.number("DemandForecast", "TimeLeft")
             when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
             what = "stuck" if is_stuck else f"getting stuck{when}"
-            return Verdict("STUCK", f"{NAMES[state]}: {what}", WARNED_ADVICE, "warned")
+            todo = MOVING_ADVICE if state in ("go", "caution") else WARNED_ADVICE
+            return Verdict("STUCK", f"{NAMES[state]}: {what}", todo, "warned")
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
         limit = known.value("Traversability", "LimitingCause")
         todo = ADVICE.get((state, str(limit)), ADVICE[state, None])
         if state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
-            todo = MEASURING  # nothing limits it: more windows must say the same
+            todo = HELD  # nothing limits it: more windows must say the same
+        worst = self.slip()
+        if state == "go" and worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
+            todo = ABOVE_BEST
         return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
 
     def _because(self) -> Iterator[str]:
@@ -258,6 +267,8 @@ class Dashboard:
         left = self.until_first_window()
         if left is not None and reason in ("none", "None", "not_excited", "model_gap"):
             return left, MEASURING
+        if left is not None and left != FIRST_IS_DUE and reason == "input_missing":
+            return f"starting, {left}", MEASURING
         if known.value("SoilbusStatus", "State") is None:
             return "no status of soilbus", MEASURING
         if known.value("SoilbusStatus", "State") == "starting":
@@ -298,7 +309,7 @@ class Dashboard:
             return None
         left = math.ceil(self.vehicle.window - (self.known.now - self._inputs_since))
         if left <= 0:
-            return "the first window is due"
+            return FIRST_IS_DUE
         return f"{'' if self._saw_them_begin else 'at most '}{left} s until the first window"
 
     def slip(self) -> Slip:
@@ -340,6 +351,14 @@ class Dashboard:
         """Largest draft [N] here and now, while it may be acted on."""
         return self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
 
+    def draft_of(self, draft: float, before: str = "of ", unknown: str = "") -> str:
+        """The draft [N] and the largest one in one unit; a negative draft brakes."""
+        most = self.max_draft()
+        unit = max(abs(draft), abs(most or 0.0))
+        now = force(draft, unit)
+        now = f"braking {now[1:]}" if now.startswith("-") else now
+        return now + (f" {before}{force(most, unit)}" if most is not None else f" {before}{unknown}" * bool(unknown))
+
     def freshness(self) -> str:
         """Age of the data behind the state."""
         age, since = (self.known.number("Traversability", name) for name in ("Age", "SinceValid"))
@@ -356,8 +375,7 @@ class Dashboard:
             best = "" if slip.best is None else f", best {percent(slip.best)}"
             parts.append(f"Slip {percent(slip.value)} at wheel {slip.wheel}{best}")
         if draft is not None:
-            possible = "" if (most := self.max_draft()) is None else f" of {force(most)}"
-            parts.append(f"Draft {force(draft)}{possible}")
+            parts.append(f"Draft {self.draft_of(draft)}")
         parts += [] if verdict.kind == "gone" else [self.freshness().capitalize()]
         parts += [f"Bus away: {self.fault}"] if self.fault else []
         return parts
@@ -368,6 +386,12 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def force(newtons: float) -> str:
-    """A force in kN, in N below 1 kN."""
-    return f"{newtons:.0f} N" if abs(newtons) < 1000.0 else f"{newtons / 1000.0:.1f} kN"
+def is_above(share: float, other: float) -> bool:
+    """Whether a share is greater than another by what a driver reads: whole per cents."""
+    return round(100.0 * share) > round(100.0 * other)
+
+
+def force(newtons: float, largest: float | None = None) -> str:
+    """A force in kN, in N where the largest one of its line (by default itself) is below 1 kN; no minus zero."""
+    size, digits, unit = (1.0, 0, "N") if abs(newtons if largest is None else largest) < 1000.0 else (1000.0, 1, "kN")
+    return f"{round(newtons / size, digits) + 0.0:.{digits}f} {unit}"

@@ -107,8 +107,10 @@ def _mark(marks: list[str], at: int, label: str) -> None:
 def _draft(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     """Title, chart of the last minute and axis, in `height` rows."""
     now, possible = dashboard.known.number("PresentDemand", "Draft"), dashboard.max_draft()
-    said = "-" if now is None else force(now)
-    said += "  of possible -" if possible is None else f"  of possible {force(possible)}"
+    if now is not None:
+        said = dashboard.draft_of(now, " of possible ", "-")
+    else:
+        said = f"-  of possible {'-' if possible is None else force(possible)}"
     columns, rows = width - AXIS, height - 2
     draft, limit = (dashboard.history(name, columns) for name in ("draft", "max_draft"))
     top = 1.05 * max([abs(value) for value in (*draft, *limit) if value is not None], default=0.0)

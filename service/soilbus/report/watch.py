@@ -207,14 +207,17 @@ def watch_log(
     _show_as(
         dashboard, source, plain, as_json,
         lambda: source.is_over or (until is not None and time.monotonic() >= until),
+        stays=seconds is None,
     )  # fmt: skip
 
 
-def _show_as(dashboard: Dashboard, source: Source, plain: bool, as_json: bool, done: Callable[[], bool]) -> None:
+def _show_as(
+    dashboard: Dashboard, source: Source, plain: bool, as_json: bool, done: Callable[[], bool], stays: bool = False
+) -> None:
     if as_json:
         print_results(dashboard, source, sys.stdout, done)
     else:
-        show(dashboard, source, Console(), plain, done)
+        show(dashboard, source, Console(), plain, done, stays=stays)
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
@@ -232,6 +235,7 @@ def show(
     plain: bool = False,
     done: Callable[[], bool] = lambda: False,
     clock: Callable[[], float] = time.monotonic,
+    stays: bool = False,
 ) -> None:
     """Feed frames and show them until `done`, or until a key says so.
 
@@ -249,6 +253,8 @@ def show(
         Whether to stop, asked in every round.
     clock
         Monotonic time [s].
+    stays
+        Whether the last page stays until a key says so, where keys can be pressed.
     """
     if plain or not console.is_terminal or console.is_dumb_terminal:
         _show_lines(dashboard, source, console, done, clock)
@@ -256,13 +262,16 @@ def show(
     name = "driver"
     with pressed_keys() as keys, Live(console=console, auto_refresh=False, screen=True) as live:
         redraw = clock()
-        while not done():
-            _take(dashboard, source, redraw - clock())
+        while not (is_over := done()) or (stays and keys is not no_key):
+            if is_over:
+                time.sleep(REDRAW_PERIOD)
+            else:
+                _take(dashboard, source, redraw - clock())
             key = keys()
             if key == "q":
                 return
             chosen = {"d": "driver", "e": "engineer", "\t": "engineer" if name == "driver" else "driver"}.get(key, name)
-            if chosen != name or clock() >= redraw:
+            if chosen != name or (clock() >= redraw and not is_over):
                 name, redraw = chosen, clock() + REDRAW_PERIOD
                 dashboard.sample()
                 live.update(page(dashboard, name, *console.size), refresh=True)
@@ -330,6 +339,11 @@ def _take(dashboard: Dashboard, source: Source, timeout: float) -> Received | ca
     return message
 
 
+def no_key() -> str:
+    """No key, as none can be pressed."""
+    return ""
+
+
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
     """A function that gives the next key pressed, or "" at once; always "" where standard input is no terminal of ours.
@@ -342,7 +356,7 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
     except (AttributeError, OSError, ValueError):
         is_ours = False
     if not is_ours:
-        yield lambda: ""
+        yield no_key
         return
 
     def key() -> str:
