@@ -4,6 +4,7 @@
     estimate        from the rows of a single-wheel test rig to a soil with standard deviations
     replay          from recorded logs to a table of windows
     diagnose        what the model misses in logs
+    signals         the decoded, admitted samples of a log as a table
     simulate        a drive of the reference tractor or of another one, as a log
     paper           the tables of Xi et al. 2024 beside ours
 
@@ -24,6 +25,7 @@ _MODULES = {
     "estimate": "soilbus.api.estimate",
     "load_config": "soilbus.config.file",
     "replay": "soilbus.api.recordings",
+    "signals": "soilbus.api.recordings",
     "simulate": "soilbus.api.recordings",
     "soil_named": "soilbus.terra.soils",
     "wheel_forces": "soilbus.api.wheel",
@@ -48,4 +50,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "paper"})
+    return sorted({*__all__, "paper"})

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.api.residuals import frame_of, plot_residuals
+from soilbus.api.wheel import wheel_forces
 from soilbus.arrays import Array
 from soilbus.config.file import load_config, parse_config
 from soilbus.config.model import Config
@@ -22,6 +24,7 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior
 from soilbus.offline.columns import TableError
 from soilbus.offline.tables import Run, replay_runs, runs_of_columns
 from soilbus.report.soil_prior import SHOWN
+from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import Soil
 from soilbus.words import did_you_mean
 
@@ -120,6 +123,8 @@ class SoilEstimate:
         Used.
     left_out
         Rows that were not, by reason.
+    readings
+        Of each channel the rows' load, slip, measured and modelled values, SI.
     """
 
     posterior: Posterior
@@ -132,6 +137,28 @@ class SoilEstimate:
     chi2: float | None
     rows: int
     left_out: Mapping[str, int]
+    readings: Mapping[str, tuple[Array, Array, Array, Array]] = field(default_factory=dict)
+
+    @property
+    def residuals(self) -> Any:
+        """pandas DataFrame: channel, slip, load, measured, modelled and residual of each row, SI."""
+        return frame_of(
+            [
+                {"channel": channel, "slip": s, "load": w, "measured": y, "modelled": m, "residual": y - m}
+                for channel, (load, slip, measured, modelled) in self.readings.items()
+                for w, s, y, m in zip(load, slip, measured, modelled, strict=True)
+            ]
+        )
+
+    def to_frame(self) -> Any:
+        """pandas DataFrame: value, std and prior of each parameter, SI."""
+        found = self.posterior.parameters()
+        rows = [(name, e.value, e.std, *self.prior[name]) for name, e in found.items()]
+        return frame_of(rows, ("parameter", "value", "std", "prior", "prior_std")).set_index("parameter")
+
+    def plot(self) -> Any:
+        """Figure of matplotlib: measured over modelled, and residuals over slip and load."""
+        return plot_residuals(self.residuals)
 
     @property
     def soil(self) -> Soil:
@@ -252,7 +279,32 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
         chi2=result.chi2,
         rows=len(found.window.t),
         left_out=found.rejected,
+        readings=_readings(config, found, result.posterior.soil),
     )
+
+
+def _readings(config: Config, found: Run, soil: Soil) -> dict[str, tuple[Array, Array, Array, Array]]:
+    """Load, slip, measured and modelled values of each channel; the wheel runs with the configured effects."""
+    window, wheel = found.window, config.wheel[0]
+    load, slip = window.load[:, 0], slip_ratio(wheel.radius, window.speed[:, 0], window.ground_speed)
+    effects = {
+        f"{effect.name}.{name}": given["value"] if isinstance(given, Mapping) else given
+        for effect in config.model.effects
+        for name, given in (effect.model_extra or {}).items()
+    }
+    modelled = wheel_forces(
+        soil, load, slip, radius=wheel.radius, width=wheel.width, model="rational", effects=effects or None
+    )
+    both = {
+        "drawbar_pull": (window.draft, modelled.drawbar_pull),
+        "torque": (window.torque[:, 0], modelled.torque),
+        "sinkage": (window.sinkage[:, 0], modelled.sinkage),
+    }
+    return {
+        name: (load[known], slip[known], measured[known], values[known])
+        for name, (measured, values) in both.items()
+        if (known := np.isfinite(measured)).any()
+    }
 
 
 def _configuration(rig: SingleWheelRig | Config | Path | str, columns: Iterable[str]) -> Config:

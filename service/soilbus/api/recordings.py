@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from soilbus.can.dbc_files import load_databases
+from soilbus.api.residuals import frame_of, plot_residuals
+from soilbus.can.admission import Admission
+from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.log_writer import write_log
+from soilbus.can.mapping import channels_of
 from soilbus.config.edit import with_effects_text
 from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config
@@ -18,30 +23,35 @@ from soilbus.diagnosis.model_out import effect_tables
 from soilbus.estimation.assembly import with_effects
 from soilbus.files import whole_file
 from soilbus.offline.diagnose import Findings, diagnose_logs
+from soilbus.offline.replay import log_of
 from soilbus.offline.replay import replay as replay_logs
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import column_names, flat_record, window_record
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.report.findings import findings_record, findings_text
 from soilbus.report.statement import statement
+from soilbus.sensors.survey import si_unit
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.recording import simulate as simulate_drive
 from soilbus.simulator.reference import TRACTOR
 
-__all__ = ["Diagnosis", "diagnose", "replay", "simulate"]
+__all__ = ["Diagnosis", "diagnose", "replay", "signals", "simulate"]
 
 PathLike = Path | str
+Logs = Any
+"""A file, a pandas DataFrame, or several of them."""
 
 
-def replay(log: PathLike | Sequence[PathLike], config: Config | PathLike) -> Any:
+def replay(log: Logs, config: Config | PathLike) -> Any:
     """The service's own windows over recorded logs, or over tables of a test rig.
 
     Parameters
     ----------
     log
-        File or files: every log that `soilbus replay` reads, or CSV and Parquet where the configuration has [table].
+        File or files: every log that `soilbus replay` reads, CSV and Parquet where the configuration has [table]; CSV,
+        Parquet, MF4 or a pandas DataFrame of signals over time where it has [columns].
     config
         Configuration, or the path of one.
 
@@ -73,11 +83,12 @@ def replay(log: PathLike | Sequence[PathLike], config: Config | PathLike) -> Any
     >>> bool(abs(last["soil.phi.value"] - soilbus.soil_named("loam").phi) < 2.0 * last["soil.phi.std"])
     True
     """
-    used, paths = _config(config), _paths(log)
-    if used.table is not None:
-        results = list(replay_tables(used, paths))
-    else:
-        results = list(replay_logs(Pipeline(used, load_databases(used)), paths))
+    used = _config(config)
+    with _paths(log) as paths:
+        if used.table is not None:
+            results = list(replay_tables(used, paths))
+        else:
+            results = list(replay_logs(Pipeline(used, load_databases(used)), paths))
     rows = [flat_record(window_record(result, used)) for result in results]
     if find_spec("pandas") is None:
         return rows
@@ -119,6 +130,32 @@ class Diagnosis:
         before, after = self.gap
         return f"{statement(self.findings.diagnosis)}{names} (gap {before:.2f} -> {after:.2f})"
 
+    @property
+    def residuals(self) -> Any:
+        """pandas DataFrame: held-out readings of each channel beside the completed model, with slip and load, SI."""
+        parts = [
+            frame_of({
+                "channel": series.channel, "wheel": series.wheel, "slip": series.slip, "load": series.load,
+                "measured": series.measured, "modelled": series.modelled,
+                "residual": series.measured - series.modelled,
+            })
+            for series in self.findings.diagnosis.completed.held_out_series()
+        ]  # fmt: skip
+        return import_module("pandas").concat(parts, ignore_index=True)
+
+    def to_frame(self) -> Any:
+        """pandas DataFrame: probability, and value and std of each parameter, of the effects found."""
+        rows = [
+            (found["name"], name, parameter["value"], parameter["std"], found["probability"])
+            for found in self.to_dict()["effects"]
+            for name, parameter in found["parameters"].items()
+        ]
+        return frame_of(rows, ("effect", "parameter", "value", "std", "probability"))
+
+    def plot(self) -> Any:
+        """Figure of matplotlib: measured over modelled, and residuals over slip and load."""
+        return plot_residuals(self.residuals)
+
     def to_dict(self) -> dict[str, Any]:
         """The object that `soilbus diagnose --json` writes (docs/json.md)."""
         return findings_record(self.findings)
@@ -146,7 +183,7 @@ class Diagnosis:
             file.write(text)
 
 
-def diagnose(logs: PathLike | Sequence[PathLike], config: Config | PathLike) -> Diagnosis:
+def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:
     """Find what the model misses in logs, or in tables of a test rig, and name it.
 
     Parameters
@@ -183,7 +220,58 @@ def diagnose(logs: PathLike | Sequence[PathLike], config: Config | PathLike) -> 
     an effect is missing, and the data tell which: slip_sinkage (gap 1.47 -> 1.02)
     """
     path = None if isinstance(config, Config) else found_configuration(str(config))
-    return Diagnosis(diagnose_logs(_config(config), _paths(logs)), path)
+    with _paths(logs) as paths:
+        return Diagnosis(diagnose_logs(_config(config), paths), path)
+
+
+def signals(log: Logs, config: Config | PathLike) -> Any:
+    """The decoded and admitted samples of every mapped signal.
+
+    Parameters
+    ----------
+    log
+        A recording, as of `replay`.
+    config
+        Configuration, or the path of one.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A column for each channel, its SI unit behind its name: `torque.FL [N.m]`; `attrs["units"]` has them, too.
+        The index is the time [s]; nan where a channel has no sample then.
+
+    Raises
+    ------
+    LogError, ConfigError
+        As `replay`.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import soilbus
+    >>> from soilbus.simulator.reference import TRACTOR
+    >>> with TemporaryDirectory() as folder:
+    ...     drive = soilbus.simulate(f"{folder}/drive.log", TRACTOR, duration=5.0)
+    ...     frame = soilbus.signals(f"{folder}/drive.log", TRACTOR)
+    >>> frame.attrs["units"]["draft"], int(frame["draft [N]"].count())
+    ('N', 250)
+    """
+    used = _config(config)
+    database = load_databases(used)
+    admission = Admission(channels_of(used, database), database, checked_messages(used, database))
+    with _paths(log) as (path,):
+        for t, identifier, extended, data, remote, error in log_of(used, path).frames():
+            if not error:
+                admission.feed(t, identifier, extended, data, remote)
+    pandas = import_module("pandas")
+    units = {channel.name: si_unit(channel) for channel in channels_of(used, database)}
+    found = {
+        f"{name} [{units[name]}]" if units[name] else name: pandas.Series(column.value, column.t)
+        for name, column in admission.take().columns.items()
+    }
+    frame = pandas.concat({name: one[~one.index.duplicated()] for name, one in found.items()}, axis=1).sort_index()
+    frame.index.name, frame.attrs["units"] = "t [s]", units
+    return frame
 
 
 def simulate(
@@ -247,5 +335,16 @@ def _config(config: Config | PathLike) -> Config:
     return config if isinstance(config, Config) else load_config(found_configuration(str(config)))
 
 
-def _paths(files: PathLike | Sequence[PathLike]) -> list[Path]:
-    return [Path(files)] if isinstance(files, (str, Path)) else [Path(file) for file in files]
+@contextmanager
+def _paths(logs: Logs) -> Iterator[list[Path]]:
+    """Paths of the files; of tables in memory those of copies that last as long as the context."""
+    given = [logs] if isinstance(logs, (str, Path)) or hasattr(logs, "to_csv") else list(logs)
+    with TemporaryDirectory(prefix="soilbus-") as folder:
+        paths = []
+        for number, log in enumerate(given, 1):
+            if hasattr(log, "to_csv"):
+                paths.append(Path(folder, f"DataFrame{number}.csv"))
+                log.to_csv(paths[-1], index=log.index.name is not None)
+            else:
+                paths.append(Path(log))
+        yield paths

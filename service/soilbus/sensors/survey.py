@@ -140,7 +140,12 @@ class Seen:
     @property
     def unit(self) -> str:
         """SI unit of its values; "" of a code."""
-        return "" if self.channel.quantity == LOCK else SI.get(_dimension(self.channel), "")
+        return si_unit(self.channel)
+
+
+def si_unit(channel: Channel) -> str:
+    """SI unit of a channel's values; "" of a code."""
+    return "" if channel.quantity == LOCK else SI.get(_dimension(channel), "")
 
 
 @dataclass(frozen=True, slots=True)
