@@ -243,7 +243,7 @@ def test_several_faults_are_all_listed(capsys):
 
 
 def test_check_lists_every_mapped_signal_with_unit_rate_and_what_can_be_told(tractor, capsys):
-    assert main(["check", "--config", str(tractor)]) == 0
+    assert main(["check", "--config", str(tractor), "--settings"]) == 0
     out = "\n".join(lines(capsys)[0])
     for part in ("torque.FL", "MotorFL.ShaftTorque", "N.m", "20 ms", "k_phi", "two tyre widths", "estimator.hop = 1.0"):
         assert part in out, part

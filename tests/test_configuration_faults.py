@@ -265,6 +265,8 @@ def test_slopes_that_nothing_shows_are_said_to_count_as_drafts(kind, capsys, tmp
 
 def test_the_settings_in_force_name_each_wheel_and_axle(capsys):
     assert main(["check", "--config", "tractor-2wd"]) == 0
+    assert "wheel.FL.driven" not in capsys.readouterr().out
+    assert main(["check", "--config", "tractor-2wd", "--settings"]) == 0
     out = capsys.readouterr().out
     assert "\nwheel.FL.driven = False\n" in out
     assert "\naxle.rear.max_torque = 16000.0\n" in out

@@ -67,6 +67,33 @@ def test_every_name_is_there_and_typed():
         _ = soilbus.wheel_force
 
 
+def test_only_public_names_are_shown():
+    assert dir(soilbus) == sorted([*soilbus.__all__, "paper"])
+
+
+def test_an_estimate_has_a_table_residuals_and_a_plot(columns):
+    found = soilbus.estimate(columns, rig())
+    table = found.to_frame()
+    assert table.loc["phi", "value"] == found.values["phi"]
+    assert table.loc["phi", "std"] == found.std["phi"]
+    left = found.residuals
+    assert set(left["channel"]) == {"drawbar_pull", "torque", "sinkage"}
+    pull = left[left["channel"] == "drawbar_pull"]
+    np.testing.assert_allclose(pull["measured"], columns["drawbar_pull"])
+    assert np.abs(pull["residual"]).median() < 0.05 * np.abs(pull["measured"]).max()
+    assert len(found.plot().axes) == 9
+
+
+def test_signals_are_the_admitted_samples_in_si(drive):
+    recording = soilbus.simulate(soil="loam", duration=14.0)
+    frame = soilbus.signals(drive, TRACTOR)
+    assert frame.attrs["units"]["torque.FL"] == "N.m"
+    t, value = recording.channels["draft"]
+    got = frame["draft [N]"].dropna()
+    assert len(got) == len(value)
+    np.testing.assert_allclose(got, value, atol=5.0)
+
+
 @pytest.mark.parametrize("law", ["exponential", "rational"])
 def test_forces_are_those_of_an_independent_integration(law):
     load, slip = np.array([1500.0, 3000.0, 6000.0]), np.array([0.1, 0.2, 0.5])

@@ -130,7 +130,7 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
     ),
     "speed": (
         ("rotation", "speed"), 0.1, {"wheel": 0.8, "speed": 0.2},
-        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative"},
+        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"},
     ),
     "load": (
         ("force", "mass"), 0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},

@@ -115,8 +115,8 @@ def run(args: argparse.Namespace) -> None:
 
         config = configured(args)
         if config.table is not None or config.columns is not None:
-            section = "[table]" if config.columns is None else "[columns]"
-            raise ConfigError([f"{section}: a table has no bus; replay and diagnose read it"])
+            source = "[columns]: a table" if config.table is None else "[table]: a table of a test rig"
+            raise ConfigError([f"{source} has no bus; replay and diagnose read it"])
         wait = args.wait or "NOTIFY_SOCKET" in os.environ
         try:
             service = start_service(config, wait)

@@ -329,9 +329,9 @@ def _times(path: Path, time: TimeColumn, cells: Sequence[Any]) -> Array:
         unit = time.unit or (ending[1] if ending and ending[1] in _TIMES else "s")
         return np.asarray(np.where(np.isfinite(values), values * _TIMES[unit], math.inf))
     dates = [_date(cell) for cell in cells]
-    if not any(date is not None for date in dates):
-        seen = f": {shown(cells[0], 40)!r} is neither a number nor a date as 2026-05-01T12:00:00.1" if cells else ""
-        raise TableError(f"{path}: column {time.time} holds no time{seen}")
+    if dates and not any(date is not None for date in dates):
+        seen = f"{shown(cells[0], 40)!r} is neither a number nor a date as 2026-05-01T12:00:00.1"
+        raise TableError(f"{path}: column {time.time} holds no time: {seen}")
     return np.array([math.inf if date is None else date for date in dates], np.float64)
 
 
