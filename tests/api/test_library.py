@@ -88,7 +88,7 @@ def test_signals_are_the_admitted_samples_in_si(drive):
     recording = soilbus.simulate(soil="loam", duration=14.0)
     frame = soilbus.signals(drive, TRACTOR)
     assert frame.attrs["units"]["torque.FL"] == "N.m"
-    t, value = recording.channels["draft"]
+    value = recording.channels["draft"].value
     got = frame["draft [N]"].dropna()
     assert len(got) == len(value)
     np.testing.assert_allclose(got, value, atol=5.0)

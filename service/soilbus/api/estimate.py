@@ -20,6 +20,7 @@ from soilbus.arrays import Array
 from soilbus.config.file import load_config, parse_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import NotFitted
+from soilbus.estimation.assembly import model_of
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior
 from soilbus.offline.columns import TableError
 from soilbus.offline.tables import Run, replay_runs, runs_of_columns
@@ -293,7 +294,7 @@ def _readings(config: Config, found: Run, soil: Soil) -> dict[str, tuple[Array, 
         for name, given in (effect.model_extra or {}).items()
     }
     modelled = wheel_forces(
-        soil, load, slip, radius=wheel.radius, width=wheel.width, model="rational", effects=effects or None
+        soil, load, slip, radius=wheel.radius, width=wheel.width, model=model_of(config), effects=effects or None
     )
     both = {
         "drawbar_pull": (window.draft, modelled.drawbar_pull),
