@@ -171,7 +171,7 @@ def log_report(log: Log | SignalTable, found: Survey) -> str:
         lines.append(f"channels: {channels or 'not named'}" + (f"; read: {log.chosen}" if log.left_out else ""))
     absent = f"; not in it: {', '.join(missing)}" if missing else ""
     lines.append(f"mapped {parts}: {len(heard)} of {len(mapped)}{absent}")
-    return "\n".join(lines) + "\n"
+    return text_of(lines)
 
 
 def survey_report(found: Survey) -> str:
