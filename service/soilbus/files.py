@@ -26,6 +26,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
+from soilbus.words import shown
+
 
 @dataclass(frozen=True, slots=True)
 class Limits:
@@ -275,6 +277,9 @@ def _name(descriptor: int, spare: Path) -> None:
 
 class NotWritten(Exception):
     """A file cannot be written; the text is one line for the user."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(shown(text))
 
 
 @contextmanager

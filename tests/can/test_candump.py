@@ -44,9 +44,17 @@ def outcome(frames: Iterator[Frame]) -> tuple[list[Frame], type[Exception] | Non
 
 
 def peer(text: str) -> tuple[list[Frame], type[Exception] | None, str]:
-    """What python-can reads of it, as far as its frames are whole and its error frames of the class that it knows."""
+    """What python-can reads of it, as far as its frames are whole and its error frames of the class that it knows.
+
+    At a line without a stamp it ends with a reason that says so, where python-can counts words.
+    """
     known = re.sub(r"(?<=[ ])[2367ABEF][0-9A-F]{7}#", "20000080#", text)
-    return outcome(frame_of(whole(message)) for message in can.CanutilsLogReader(io.StringIO(known)))
+    unstamped = re.search(r"^[ \t]*[^\s(]\S*[ \t]+[0-9A-Fa-f]{3,8}#", known, re.MULTILINE)
+    stamped = io.StringIO(known[: unstamped.start()] if unstamped else known)
+    found = outcome(frame_of(whole(message)) for message in can.CanutilsLogReader(stamped))
+    if unstamped is None or found[1] is not None:
+        return found
+    return found[0], ValueError, "its lines have no time stamps: record with candump -L, or candump -ta"
 
 
 @settings(max_examples=300, deadline=None)
@@ -60,6 +68,9 @@ def test_frames_equal_those_of_python_can(lines: list[str]) -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(plain_lines | garbage, max_size=10), st.booleans())
+@example([PLAIN, "can0 12A#00\n", PLAIN], False)
+@example([PLAIN, "\n", "(1) can0 12\n", "c1c 012# 1#00\n"], False)
+@example(["c1c 012# 1#00\n"], False)
 def test_garbage_gives_the_same_frames_and_then_the_same_error(lines: list[str], cut: bool) -> None:
     text = "".join(lines)[: -5 if cut else None]
     assert outcome(candump_frames(io.StringIO(text))) == peer(text)

@@ -17,7 +17,7 @@ from statistics import median
 from soilbus.can.candump import Batch, Frame
 from soilbus.can.log_formats import HEAD, Format, MissingExtraError, format_of
 from soilbus.files import opened, packing, within_ratio
-from soilbus.words import one_line
+from soilbus.words import one_line, shown
 
 CHANNEL_SCAN_FRAMES = 2000
 """Frames of a log in which its channels are looked for: several seconds of a bus."""
@@ -37,6 +37,9 @@ class LogError(Exception):
 
     windows = 0
     lasting = True
+
+    def __init__(self, text: str) -> None:
+        super().__init__(shown(text))
 
 
 class OtherBus(LogError):
