@@ -12,7 +12,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
 
+import asammdf
 import can
+import numpy as np
 import pytest
 
 from soilbus.can.logs import Log, LogError
@@ -145,8 +147,6 @@ def test_a_text_gives_the_frames_whatever_its_name(kind: str, encoding: str, tmp
 
 @pytest.mark.parametrize("kind", [".blf", ".mf4", ".db", ".csv", ".asc"])
 def test_what_python_can_writes_gives_the_frames(kind: str, tmp_path: Path) -> None:
-    if kind == ".mf4":
-        pytest.importorskip("asammdf")
     path = tmp_path / f"drive{kind}"
     with can.Logger(path) as log:
         for t, identifier, data in FRAMES:
@@ -160,6 +160,20 @@ def test_what_python_can_writes_gives_the_frames(kind: str, tmp_path: Path) -> N
                 )
             )
     check_same(Log(path, "can0"), 1e-5)
+
+
+def test_an_mf4_of_decoded_signals_has_its_reason(tmp_path: Path) -> None:
+    path = tmp_path / "decoded.mf4"
+    stamps = np.arange(0.0, 2.0, 0.01)
+    with asammdf.MDF(version="4.10") as signals:
+        for name in ("Torque", "Speed"):
+            signals.append(asammdf.Signal(np.sin(stamps), stamps, name=name, unit="N m"))
+        signals.save(path)
+    with pytest.raises(LogError) as fault:
+        list(Log(path).frames())
+    assert str(fault.value) == (
+        f"{path}: not a CAN log that can be read (it has no CAN frames: decoded signals, perhaps)"
+    )
 
 
 def packed_by_zstd(data: bytes) -> bytes:
@@ -226,6 +240,14 @@ def test_what_gives_no_frames_has_its_reason(content: str, reason: str, tmp_path
     (tmp_path / "x.log").write_text(content)
     with pytest.raises(LogError, match=reason):
         list(Log(tmp_path / "x.log").frames())
+
+
+def test_a_channel_of_control_characters_is_text_in_a_fault(tmp_path: Path) -> None:
+    (tmp_path / "x.log").write_text("(1.0) a\x1b[31m\u202e 123#00\n(2.0) b\x07 123#00\n")
+    with pytest.raises(LogError) as fault:
+        list(Log(tmp_path / "x.log", "can0").frames())
+    assert str(fault.value).isprintable()
+    assert r"a\x1b[31m\u202e and b\x07" in str(fault.value)
 
 
 @pytest.mark.parametrize(

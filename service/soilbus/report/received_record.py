@@ -83,6 +83,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         "chi2": number("SoilStrength", "Chi2"),
         "bus": {key: _whole(number("BusHealth", signal)) for key, signal in COUNTS.items()},
         "bad_frames": received.bad_frames,
+        "second_sender": received.has_second_sender,
         "fault": dashboard.fault or None,
         "text": ". ".join(dashboard.sentences()) + ".",
     }
@@ -92,7 +93,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
 
 def gist(record: dict[str, Any]) -> tuple[Any, ...]:
     """The window and the states of a record; where they change there is something to say."""
-    of_window = (record[key] for key in ("window", "status", "state", "reason", "fault"))
+    of_window = (record[key] for key in ("window", "status", "state", "reason", "fault", "second_sender"))
     return (*of_window, record["traversability"]["state"], record["warning"]["state"])
 
 
