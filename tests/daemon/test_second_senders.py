@@ -45,7 +45,9 @@ def joined(recording: list[can.Message], first: float, last: float) -> list[can.
         data[0] ^= 0x40
         data[6] = data[6] & 0x0F | i * 3 % 16 << 4
         data[7] = frame_checksum(MOTOR, bytes(data), 7)
-        forged.append(can.Message(timestamp=message.timestamp + 0.005, arbitration_id=MOTOR, data=data))
+        forged.append(
+            can.Message(timestamp=message.timestamp + 0.005, arbitration_id=MOTOR, data=data, channel=message.channel)
+        )
     return sorted([*recording, *forged], key=lambda m: m.timestamp)
 
 

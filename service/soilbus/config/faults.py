@@ -72,8 +72,6 @@ def _text(error: Any) -> str:
         return _unknown_key(error["loc"])
     if kind == "missing":
         return "missing"
-    if kind == "signal_name":
-        return f'{_shown(given)} is not "Message.Signal", the names of a message and of its signal in the DBC'
     if kind == "string_pattern_mismatch":
         return f"{_shown(given)} is no name: 1 to 16 letters, digits, - or _"
     if kind == "literal_error":

@@ -26,10 +26,9 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
 from soilbus.grouping import grouped
-from soilbus.words import did_you_mean, shown
+from soilbus.words import LONGEST_NAME, did_you_mean, shown
 
 __all__ = [
     "J1939",
@@ -69,7 +68,8 @@ Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
 def _signal_name(value: str, info: ValidationInfo) -> str:
     """The same name, which without [columns] must be "Message.Signal"."""
     if not (info.context or {}).get("columns") and not re.fullmatch(r"[^.\s]+\.[^.\s]+", value):
-        raise PydanticCustomError("signal_name", "no signal")
+        name = value if len(value) <= LONGEST_NAME else f"{value[:LONGEST_NAME]}..."
+        raise ValueError(f'"{name}" is not "Message.Signal", the names of a message and of its signal in the DBC')
     return value
 
 

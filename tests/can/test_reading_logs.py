@@ -196,5 +196,5 @@ def test_check_says_of_standard_input_what_it_is() -> None:
         input=bursts(0.02).replace("can0", "can1").encode() + LINE, capture_output=True, timeout=120.0, check=False,
     )  # fmt: skip
     said = done.stdout.decode()
-    assert "\nstandard input: candump log, 0.6 s, 301 frames\nchannels: can0 1, can1 300; read: can1\n" in said
+    assert "standard input: candump log, 0.6 s, 301 frames\nchannels: can0 1, can1 300; read: can1\n" in said
     assert "\nmapped messages: 1 of " in said
