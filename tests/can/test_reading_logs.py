@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import lzma
 import struct
@@ -13,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import can
+import pyarrow as pa
 import pytest
 
 from soilbus.can.dbc_files import load_databases
@@ -30,10 +32,16 @@ def packed_lines(pack: Callable[..., object]) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         with pack(path, "wb") as file:  # type: ignore[attr-defined]
             file.write(LINE * 200)
-            for _ in range(600 if pack is gzip.open else 200):
+            for _ in range({gzip.open: 600, bz2.open: 40}.get(pack, 200)):
                 file.write(b" " * 60_000 + b"\n" if pack is gzip.open else LINE * 20_000)
 
     return write
+
+
+def zstd_lines(path: Path) -> None:
+    with pa.output_stream(path, compression="zstd") as file:
+        for _ in range(100):
+            file.write(LINE * 20_000)
 
 
 def blf_of(containers: int, mebibytes: int) -> Callable[[Path], None]:
@@ -55,11 +63,13 @@ def blf_of(containers: int, mebibytes: int) -> Callable[[Path], None]:
     ("write", "reason"),
     [
         (packed_lines(lzma.open), "unpacks to more than 250 times its size"),
+        (packed_lines(bz2.open), "unpacks to more than 250 times its size"),
+        (zstd_lines, "unpacks to more than 250 times its size"),
         (packed_lines(gzip.open), "a line that is no frame|unpacks to more"),
         (blf_of(64, 4), "unpacks to more than 250 times its size"),
         (blf_of(1, 80), "a block of more than 64 MiB"),
     ],
-    ids=["lines", "blanks", "containers", "container"],
+    ids=["lines", "bzip2", "zstd", "blanks", "containers", "container"],
 )
 def test_a_small_log_that_unpacks_to_much_is_refused_in_little_memory(
     write: Callable[[Path], None], reason: str, tmp_path: Path
@@ -76,6 +86,25 @@ def test_a_small_log_that_unpacks_to_much_is_refused_in_little_memory(
     finally:
         tracemalloc.stop()
     assert n >= 1
+
+
+@pytest.mark.parametrize(("blocks", "mebibytes", "reason"), [(1, 80, "a block of more than 64 MiB"), (40, 32, "250")])
+def test_an_mf4_of_blocks_that_unpack_to_much_is_refused(
+    blocks: int, mebibytes: int, reason: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("asammdf")
+    packed = zlib.compress(bytes(mebibytes << 20), 9)
+    lengths = struct.pack("<4xQQ", mebibytes << 20, len(packed))
+    block = b"##DZ" + struct.pack("<4xQQ", 48 + len(packed), 0) + b"DT\0\0" + lengths + packed
+    path = tmp_path / "bomb.mf4"
+    path.write_bytes(b"MDF     4.10    soilbus " + bytes(40) + block * blocks)
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=reason):
+            list(Log(path).frames())
+        assert tracemalloc.get_traced_memory()[1] < 150 * 2**20
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_log_of_constant_data_is_no_bomb(tmp_path: Path) -> None:
