@@ -1,4 +1,4 @@
-"""The formats of logs that people have, each told by its content and read as frames with their channels.
+"""The formats of logs that people have, each recognised by its content and read as frames with their channels.
 
     first bytes -> Format(name, frames)         frames(stream) -> batches of (channels, frames)
 
@@ -31,7 +31,7 @@ from soilbus.can.candump import Batch, candump_batches, is_candump, of_message
 from soilbus.files import LIMITS, text_lines, within_ratio
 
 HEAD = 1 << 13
-"""Bytes at the begin of a log by which its format is told."""
+"""Bytes at the begin of a log by which its format is recognised."""
 WRAP = 1 << 32
 """Microseconds after which the stamps of an analyser of 32 bits begin again."""
 DAY = 86400.0
@@ -110,7 +110,7 @@ def asc(lines: Iterable[str]) -> Iterator[Batch]:
 
 
 class _Csv(NamedTuple):
-    """Name of a CSV of frames, the columns by which it is told, and the frame of a row of all its columns."""
+    """Name of a CSV of frames, the columns by which it is recognised, and the frame of a row of all its columns."""
 
     name: str
     columns: frozenset[str]

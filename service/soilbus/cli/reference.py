@@ -137,7 +137,7 @@ def commands_page() -> str:
         " `--set wheel.FL.radius=0.51`) overrides a value of the configuration in any command that takes `--config`."
         " Without `--config` it is `soilbus.toml` in the current folder; `tractor`, `tractor-2wd` and `tractor-axles`"
         " name reference machines. An output file is there whole or not at all; workers end with the command. \n\nLogs"
-        " are told by their content, whatever their name: candump (`-L`, or its console output with stamps), SavvyCAN"
+        " are recognised by content, whatever their name: candump (`-L`, or its console output with stamps), SavvyCAN"
         " (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite of python-can;"
         " plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as UTC. Of a log with"
         " several channels `bus.channel` is read, or `--channel`; the others are counted and said. `canN` is also the"
