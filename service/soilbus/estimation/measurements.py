@@ -317,6 +317,19 @@ class Measurements:
         return np.concatenate(parts, axis=1)
 
     @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which residuals (N, m) have a measurement."""
+        return self._known
+
+    @property
+    def measured_latents(self) -> NDArray[np.bool_]:
+        """Which latents (2 W + 1,) a sensor measures, and no geometry or coupling computes."""
+        given, W = self.rig.instrumentation, self.n_wheels
+        if given is None:
+            return np.ones(2 * W + 1, bool)
+        return np.array([*(row.kind == "channel" for row in (*given.load, *given.speed)), True])
+
+    @property
     def _n_residuals(self) -> int:
         """Number m of residuals of an instant."""
         return int(self._row_var.shape[1])

@@ -19,6 +19,7 @@ __all__ = [
     "SearchOptions",
     "SolverOptions",
     "TrackerOptions",
+    "VarianceOptions",
 ]
 
 
@@ -117,14 +118,11 @@ class SearchOptions:
     curved where the soil alone is not."""
     soil_alone: SolverOptions = SolverOptions(10, step_tolerance=0.1, max_rise=0.0)
     """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
-    cold: SolverOptions = SolverOptions()
+    cold: SolverOptions = SolverOptions(step_tolerance=1e-2)
     """Joint descent of soil, gains and latents from there."""
-    warm: SolverOptions = SolverOptions(step_tolerance=2e-4)
-    """Joint descent from near the optimum: of 382 windows of the golden recordings 9 in 10 end within 0.02 posterior
-    sd of it, after 2 evaluations in the mean."""
-    along_n: SolverOptions = SolverOptions(step_tolerance=1e-2)
-    """Descent of a node of the average along n: with 2e-4 a node takes 2.7 evaluations in place of 2.1.  In 28 windows
-    of two machines without load cells means of log n then differ by 0.11 sd at most (0.02 rms), and its sd by 4 %."""
+    warm: SolverOptions = SolverOptions(step_tolerance=1e-2)
+    """Joint descent from near the optimum, to 0.1 posterior sd: nearer, valleys of a drive that shakes end at no
+    optimum (85 of 170 windows of `b-2wd-loam` with 2e-4, 4 with 1e-2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +175,9 @@ class TrackerOptions:
     no golden value moves."""
     settled_sd: float = 1.5
     """The same [sd] just after a border: its remains in the window bias the soil long before they are a mismatch."""
+    first_rounds: int = 4
+    """Fits of a first window, each with the variance components that the one before left: the factors of `d-base-0`
+    then change by less than a tenth."""
     significance: float = 25.0
     """Fall of -2 log evidence by two soils instead of one [1] from which the change is accepted; of -2 log posterior by
     a longer transition, beyond the number of residuals left out, and by path curvature at knots; score statistic above
@@ -204,6 +205,23 @@ class TrackerOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class VarianceOptions:
+    """How variance components are learned from residuals (`variance_components`)."""
+
+    block: float = 1.0
+    """Length of a block [s]: an axle bounces at 1.5 to 3 Hz, so that a second holds whole cycles of it."""
+    memory: float = 30.0
+    """Windows [1] over which factors are averaged, one a hop: half a minute of the same ground."""
+    least: float = 0.05
+    """Least factor on a variance [1]: sensors twice to four times as good as their data sheets say."""
+    most: float = 400.0
+    """Largest factor on a variance [1]: twenty times the sd of a data sheet, as loads that shake by 12 % have beside
+    cells of 0.8 %."""
+    least_share: float = 0.02
+    """Share of its own noise [1] an instant that corrections of a kind must show for its factor to be learned."""
+
+
+@dataclass(frozen=True, slots=True)
 class EstimatorOptions:
     """All of them."""
 
@@ -211,6 +229,7 @@ class EstimatorOptions:
     search: SearchOptions = SearchOptions()
     posterior: PosteriorOptions = PosteriorOptions()
     tracker: TrackerOptions = TrackerOptions()
+    variance: VarianceOptions = VarianceOptions()
 
 
 ESTIMATOR = EstimatorOptions()

@@ -64,7 +64,7 @@ def _spread(value: Array, variance: Array) -> tuple[float | None, float | None]:
 
 def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
     """What varied too little in a window: load_range, slip_range or both, as far as its posterior says so."""
-    posterior = fit.reported.posterior
+    posterior = fit.posterior
     low, high = loaded_depths(fit, rig)
     bearing = posterior.bearing_pressure(min(max(settings.z_ref, low), high), settings.b_ref)
     sheared = posterior.tan_phi(), posterior.shear_strength(contact_pressure(fit, rig))

@@ -153,7 +153,7 @@ class WindowEstimator:
         status, reason = self._status(task, tracked)
         own = posterior = None
         if fit is not None and status is not Status.INVALID:
-            own = posterior = fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
+            own = posterior = fit.mode.posterior.widened(_widening(tracked, fit), self.prior)
             if fit.form is not None:
                 posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
         basis = self._basis(task, fit)
@@ -284,7 +284,7 @@ class WindowEstimator:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
         return UncertainModel.of(
-            self.model, *self._effects_and_parameters, fit.reported, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, widening, fit.form
         )
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
@@ -311,7 +311,7 @@ class WindowEstimator:
         index = self._gain_names.index(name)
         if tracked.fit is None or tracked.mismatch:
             return Estimate(0.0, self._gain_std[index])
-        return tracked.fit.reported.gain(index)
+        return tracked.fit.mode.gain(index)
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
@@ -367,17 +367,13 @@ class WindowEstimator:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
-        if fit.off_scale:
-            return Status.DEGRADED, self._mismatch
-        if self._ambiguous(fit):
-            return Status.NOT_EXCITED, "ambiguous"
         if lacks := lacking(fit, self.rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
 
     def _shows_strength(self, fit: Fit) -> bool:
         """Whether the window determines tan phi."""
-        tan_phi = fit.reported.posterior.tan_phi()
+        tan_phi = fit.mode.posterior.tan_phi()
         return tan_phi.std <= self._settings.max_tan_phi_std * tan_phi.value
 
     def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
@@ -394,15 +390,6 @@ class WindowEstimator:
         if fit is None:
             return "model_mismatch" if tracked.search_ended else "not_finite"
         return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
-
-    def _ambiguous(self, fit: Fit) -> bool:
-        """Whether a second mode has a bearing pressure or tan phi outside the first one's 95 % interval."""
-        if fit.second_mode is None:
-            return False
-        one, other = fit.mode.posterior, fit.second_mode.gaussian.posterior
-        pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
-        return any(abs(a.value - b.value) > NORMAL_95 * a.std for a, b in pairs)
-
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:
     """Which soil a window is of, and why."""
