@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.local_cubics import Series, curve_of
+from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -51,7 +52,7 @@ _BY_INSTANT = (
     "inertia", "inertia_var", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
     "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
-    "_side_known",
+    "_side_known", "standing_rows", "standing_latents",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
 _BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
@@ -59,7 +60,7 @@ _BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
 
 
 def gain_names(rig: Rig) -> list[str]:
-    """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft."""
+    """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft; then of STANDING."""
     return gains_of(rig)[0]
 
 
@@ -77,7 +78,7 @@ def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
             rows = getattr(given, quantity)
             names += [f"{quantity}.{row.name or f'{row.kind}{row.at}'}" for row in rows]
             std += [row.gain for row in rows]
-    return names, std
+    return [*names, *STANDING], [*std, *standing_std(rig)]
 
 
 class Measurements:
@@ -176,10 +177,22 @@ class Measurements:
         known = np.concatenate(known_rows[:n_kinds], axis=1)
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
+        self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None
         self.common_weights: Array | None = None
         self._off_curve: Array | None = None
         self._count()
+
+    def _stand(self, columns: StandingColumns, kept: NDArray[np.intp]) -> None:
+        """Set the derivatives by STANDING of the rows (N, m, S) and of the observed latents (N, 2 W + 1, S)."""
+        torque, latents = columns.torque[kept], columns.latents[kept]
+        if self._torque_matrix is not None and self._latent_matrix is not None:
+            torque, latents = self._torque_matrix @ torque, self._latent_matrix @ latents
+        self.standing_rows = np.zeros((*self._row_var.shape, len(STANDING)))
+        self.standing_rows[:, : self.n_wheels] = torque
+        self.standing_rows[:, self.n_wheels] = columns.demand[kept]
+        self.standing_rows[~self._known] = 0.0
+        self.standing_latents = latents
 
     def on_curves(self) -> Self:
         """The same with latents on smooth curves of what is measured, where two wheels share a torque.

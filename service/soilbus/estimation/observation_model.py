@@ -80,7 +80,7 @@ class Layout(NamedTuple):
 
     rows of an instant (m): torques, balance, sinkages; latents (2 W + 1): loads, speeds, ground_speed.
     columns: RESIDUAL | SOIL | sensor_columns | effect_columns; within `gains` (G,): sensors (torque_gains,
-    latent_gains in the order of the latents, draft_gain), then effects.
+    latent_gains in the order of the latents, draft_gain, standing as in `standing.STANDING`), then effects.
     """
 
     torques: slice
@@ -94,6 +94,7 @@ class Layout(NamedTuple):
     torque_gains: slice
     latent_gains: slice
     draft_gain: int
+    standing: slice
     effects: slice
     sensor_columns: slice
     effect_columns: slice
@@ -105,8 +106,8 @@ class Layout(NamedTuple):
         return cls(
             torques=wheels, balance=W, sinkages=slice(W + 1, None),
             n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
-            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, n_sensors - 1),
-            draft_gain=n_sensors - 1, effects=slice(n_sensors, None),
+            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
+            draft_gain=3 * W + 1, standing=slice(3 * W + 2, n_sensors), effects=slice(n_sensors, None),
             sensor_columns=slice(FIRST_GAIN, column),
             effect_columns=slice(column, None),
         )  # fmt: skip
@@ -321,12 +322,16 @@ class ObservationModel(Measurements):
             residual[:, sinkages] = self.sinkage - at.value[2]
             by_soil[:, sinkages] = -at.by_soil[2].transpose(1, 2, 0)
             by_effects[:, sinkages] = -at.by_effects[2].transpose(1, 2, 0)
+        standing = gains[self.layout.standing]
+        corrected += self.standing_latents @ standing
+        residual += self.standing_rows @ standing
         now = self.observed(latents.joined())
         latent_by_gain = now * of_latents
         if by_sensors:
             by_gain = rows[:, :, layout.sensor_columns]
             np.einsum("nww->nw", by_gain[:, torques, layout.torque_gains])[:] = -of_torque * torque
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, layout.latent_gains])
+            by_gain[:, :, layout.standing] = self.standing_rows + A @ self.standing_latents
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
             residual += self.delay_residuals(delay, A, gains)
@@ -559,7 +564,7 @@ class ObservationModel(Measurements):
         fit better.
         """
         layout = self.layout
-        gain_factors = 1.0 / (1.0 + gains[layout.sensors])
+        gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
         of_torque, of_latents = gain_factors[layout.torque_gains], gain_factors[layout.latent_gains]
         of_draft = float(gain_factors[layout.draft_gain])
         row_var = self._row_var.copy()
@@ -587,7 +592,7 @@ class ObservationModel(Measurements):
         """
         residual, layout = np.zeros(A.shape[:2]), self.layout
         if delay is not None:
-            gain_factors = 1.0 / (1.0 + gains[layout.sensors])
+            gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
             residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains] - delay.predicted
             residual[:, layout.balance] = delay.demand
             residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
@@ -614,6 +619,7 @@ class ObservationModel(Measurements):
         if noise is None:
             noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
         new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
+        new += self.standing_latents @ gain_step[layout.standing]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
         new[:, self._side_columns] = at.side_load

@@ -18,6 +18,7 @@ __all__ = [
     "PosteriorOptions",
     "SearchOptions",
     "SolverOptions",
+    "StandingOptions",
     "TrackerOptions",
     "VarianceOptions",
 ]
@@ -205,6 +206,26 @@ class TrackerOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class StandingOptions:
+    """Prior sd of the standing parts of every model (`standing`); 0 holds one at none."""
+
+    relaxation_length: float = 0.1
+    """[m]: tyres relax over 0.05 to 0.3 m (Pacejka 2012, ch. 7)."""
+    wheel_inertia: float = 5.0
+    """[`wheel_mass_share` discs]: a motor behind its gear adds many times the wheel's own inertia."""
+    wheel_mass_share: float = 0.03
+    """Mass of a wheel over that of the vehicle [1]: 2.4 to 3.6 % of a robot, a tractor and a loader."""
+    load: float = 0.04
+    """Lateness of loads beside torque and wheel speed [s]: a cycle of 20 ms and a filter of 20 to 30 ms."""
+    ground_speed: float = 0.15
+    """[s]: a radar 0.05 to 0.15 s, receivers of positions 0.1 to 0.3 s."""
+    draft: float = 0.05
+    """[s]: as `load`, and a filter against the hitch's vibration."""
+    acceleration: float = 0.04
+    """[s], as `load`."""
+
+
+@dataclass(frozen=True, slots=True)
 class VarianceOptions:
     """How variance components are learned from residuals (`variance_components`)."""
 
@@ -229,6 +250,7 @@ class EstimatorOptions:
     search: SearchOptions = SearchOptions()
     posterior: PosteriorOptions = PosteriorOptions()
     tracker: TrackerOptions = TrackerOptions()
+    standing: StandingOptions = StandingOptions()
     variance: VarianceOptions = VarianceOptions()
 
 

@@ -588,8 +588,8 @@ class Tracker:
         if not ended:
             return self._initial_prior(problem)
         end, gaussian = self._posteriors[ended[-1]]
-        elapsed = (t - end) / self.settings.window
-        gains = problem.gain_std**2 * min((elapsed + 1.0) / self.options.gain_memory, 1.0)
+        elapsed = (t - end) / self.settings.window + 1.0  # from the middle of that window to the middle of this one
+        gains = problem.gain_std**2 * min(elapsed / self.options.gain_memory, 1.0)
         if self._state.transition is not None and end <= self._state.transition.end:
             return gaussian.with_prior_soil(self.soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
         form = (
@@ -639,7 +639,8 @@ class Tracker:
             return None
         joint_prior = objective.joint_prior.form or FormPosterior.of(self.settings.form, len(fit.gains))
         with np.errstate(all="ignore"):
-            return form_posterior(objective, fit, joint_prior)
+            pr = FormPosterior.of(self.settings.form, len(fit.gains))
+            return form_posterior(objective, fit, replace(joint_prior, mean=pr.mean, covariance=pr.covariance))
 
     def _store(self, tracked: TrackerOutput, state: SoilState, end: float, problem: ObservationModel) -> None:
         """Store the result for later windows; a mismatch does not become a prior."""
