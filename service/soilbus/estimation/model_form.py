@@ -147,7 +147,18 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
     if own is None:
         return prior
     of_gradient, of_information = approximation.explained(cross)
-    found = solve_with_inverse(information - of_information + own[1], own[0] - gradient + of_gradient)
+    m = optimum.at.by_latents.shape[1]
+    theta = approximation.covariance @ cross.T
+    J = optimum.at.rows @ approximation.directions
+    marg = by_form - J @ theta
+    r = (optimum.at.weighed[:, :1])
+    block = np.repeat(np.floor(problem.t / 1.0).astype(int), m)
+    starts = np.flatnonzero(np.diff(block, prepend=block[0] - 1))
+    g = np.add.reduceat(marg * r, starts, axis=0)
+    I = information - of_information
+    kappa = float(np.trace(np.linalg.lstsq(I, g.T @ g, rcond=None)[0])) / len(free)
+    k = 3 * max(kappa, 1.0)
+    found = solve_with_inverse(I / k + own[1], own[0] + (of_gradient - gradient) / k)
     if found is None:
         return prior
     sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)

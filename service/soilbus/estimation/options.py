@@ -171,11 +171,8 @@ class TrackerOptions:
 
     false_alarms_per_hour: float = 1.0
     """Windows an hour [1/h] in which noise alone makes the change detector search for another soil."""
-    mismatch_sd: float = 3.5
-    """Sd of reduced chi-square [sd] by which a window may exceed `Settings.max_chi2`; 0 after a mismatch.  With 2 and 6
-    no golden value moves."""
-    settled_sd: float = 1.5
-    """The same [sd] just after a border: its remains in the window bias the soil long before they are a mismatch."""
+    several_soils: float = 3.0
+    """Chi-square per residual [1], in units of what the windows before left, above which another soil is looked for."""
     first_rounds: int = 4
     """Fits of a first window, each with the variance components that the one before left: the factors of `d-base-0`
     then change by less than a tenth."""
@@ -195,8 +192,6 @@ class TrackerOptions:
     """Windows [1] that the data must fill for the posterior to be a later prior: with less it is not Gaussian."""
     max_unexplained: float = 2.0
     """Windows [1] after a change point during which a change may explain a mismatch."""
-    extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
-    """Shares [1] of a new soil's data that are tried as part of its transition."""
     transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
     """Lengths of a transition that are tried [wheelbases; of a rig wheel diameters]: borders are sharp or gradual."""
     gain_memory: float = 60.0
@@ -211,7 +206,7 @@ class StandingOptions:
 
     relaxation_length: float = 0.1
     """[m]: tyres relax over 0.05 to 0.3 m (Pacejka 2012, ch. 7)."""
-    wheel_inertia: float = 5.0
+    wheel_inertia: float = 10.0
     """[`wheel_mass_share` discs]: a motor behind its gear adds many times the wheel's own inertia."""
     wheel_mass_share: float = 0.03
     """Mass of a wheel over that of the vehicle [1]: 2.4 to 3.6 % of a robot, a tractor and a loader."""

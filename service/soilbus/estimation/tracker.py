@@ -25,8 +25,8 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -46,6 +46,7 @@ from soilbus.estimation.observation_model import (
 )
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
+from soilbus.estimation.prediction import Share, prediction_shares
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import Rig, Window, window_of_samples
@@ -120,8 +121,6 @@ class Settings:
         Ground speed [m/s] up to which instants are left out.
     max_turn : float
         Relative difference of an axle's rim speeds above which instants are left out.
-    max_chi2 : float
-        Reduced chi-square allowed on average.
     drift : float
         Sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time.
     min_rows : int
@@ -137,7 +136,6 @@ class Settings:
     window: float
     min_speed: float
     max_turn: float
-    max_chi2: float
     drift: float
     min_rows: int = 60
     form: tuple[float, ...] = ()
@@ -255,6 +253,8 @@ class TrackerOutput:
         Why the state is so.
     change : ChangePoint or None
         The present change point.
+    prediction : Mapping of str to Share
+        By channel, how far the newest data are from what the windows before predict.
     """
 
     fit: Fit | None
@@ -266,6 +266,7 @@ class TrackerOutput:
     search_ended: bool = False
     reason: Reason = Reason.ONE_SOIL
     change: ChangePoint | None = None
+    prediction: Mapping[str, Share] = field(default_factory=dict)
 
 
 class _Present(NamedTuple):
@@ -386,12 +387,12 @@ class Tracker:
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)
         fit = explanation.fit
-        settled = fit is not None and self._is_settled(fit)
+        settled = not self.mismatch(fit)
         shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit), settled)
         state = next_state(self._state, shown, end, self.settings.window)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
-            reason=state.reason, change=state.change,
+            reason=state.reason, change=state.change, prediction=self._prediction(one),
         )  # fmt: skip
         self._store(tracked, state, end, explanation.objective.problem)
         return tracked
@@ -445,6 +446,13 @@ class Tracker:
             one = _Explanation(warm.objective, fit_warm(warm) or fit, present.since, None, transition=one.transition)
         return present, one
 
+    def _prediction(self, one: _Explanation) -> Mapping[str, Share]:
+        """The newest data beside their prediction by the last window's estimate."""
+        if one.warm is None or one.warm.model is None or self._fit is None:
+            return {}
+        problem, last = one.warm.objective.problem, float(self._fit.optimum.t[-1])
+        return prediction_shares(problem, one.warm.model.linearisation, last, self.rig.options.variance.block)
+
     def _change_point(self, present: _Present, one: _Explanation) -> ChangePoint | None:
         """Where the newest data disagree with the present soil; what it was while nothing explains the data since."""
         options, length, change, last = self.options, self.settings.window, self._state.change, self._fit
@@ -463,7 +471,7 @@ class Tracker:
         predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
         false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
         found = change_statistic(warm.objective, predicted, warm.iterate, at.linearisation, first, false_alarms)
-        if not found.is_alarm and fit is not None and fit.chi2 <= self.chi2_limit(fit):
+        if not found.is_alarm and not self.mismatch(fit):
             return None
         begin, window = float(t[found.instant]), present.window
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
@@ -568,19 +576,9 @@ class Tracker:
         self._budget.spend(work_before)
         return fit
 
-    def _is_settled(self, fit: Fit) -> bool:
-        """Whether the chi-square of a new soil's fit keeps its limit just after a border."""
-        limit = self.settings.max_chi2 + self.options.settled_sd * math.sqrt(2.0 / max(fit.rows, 1))
-        return fit.converged and fit.chi2 <= limit
-
     def mismatch(self, fit: Fit | None) -> bool:
-        """Whether a fit failed or its chi-square exceeds the limit."""
-        return fit is None or not fit.converged or fit.chi2 > self.chi2_limit(fit)
-
-    def chi2_limit(self, fit: Fit) -> float:
-        """Limit of a fit's reduced chi-square: `max_chi2` + sd sqrt(2 / residuals)."""
-        deviations = 0.0 if self._state.mismatch else self.options.mismatch_sd
-        return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
+        """Whether a fit failed, or fits much worse than the windows before: its data may be of several soils."""
+        return fit is None or not fit.converged or fit.chi2 > self.options.several_soils
 
     def _prior_at(self, t: float, problem: ObservationModel) -> Gaussian:
         """Posterior of the newest window that ended by t [s], plus drift since."""

@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, Optimum
@@ -89,7 +88,6 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     known = problem.known
     rows = np.where(known, np.sqrt(row_var) * e, 0.0), np.where(known, of_rows, 0.0)
     latents = np.sqrt(variance) * by_latents, np.where(problem.measured_latents, shares, 0.0)
-    block = np.floor(problem.t / options.block).astype(np.intp)
     layout, found = problem.layout, {}
     for kind, (values, expected), columns in (
         ("torque", rows, layout.torques),
@@ -102,11 +100,11 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
         total = float(expected[:, columns].sum())
         if total > options.least_share * N:
             value = np.where(expected[:, columns] > 0.0, values[:, columns], 0.0)
-            found[kind] = max(float((value**2).sum()), _of_blocks(value, block)) / total
+            found[kind] = max(float((s**2).sum()) for s in (value, block_sums(value, problem.t, options.block))) / total
     return found
 
 
-def _of_blocks(values: Array, block: NDArray[np.intp]) -> float:
-    """Sum over blocks and columns of the squared sums of values (N, C)."""
-    starts = np.flatnonzero(np.diff(block, prepend=block[0] - 1))
-    return float((np.add.reduceat(values, starts, axis=0) ** 2).sum())
+def block_sums(values: Array, t: Array, block: float) -> Array:
+    """Return sums (B, C) of values (N, C) at times t (N,) [s] over blocks of this length [s]."""
+    number = np.floor(t / block).astype(np.intp)
+    return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(number, prepend=number[0] - 1)), axis=0))

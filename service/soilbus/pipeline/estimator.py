@@ -10,7 +10,7 @@ loss of traction, immobilisation watch.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,7 +47,7 @@ from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.determination import excitation_of, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask
-from soilbus.pipeline.model_gap import GapWatch, squares
+from soilbus.pipeline.model_gap import GapWatch, PredictionWatch, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.effects.steady import CompletedModel
@@ -109,7 +109,7 @@ class WindowEstimator:
         self._effects_and_parameters = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
-        self._gap = GapWatch(config.estimator.window, config.estimator.hop)
+        self._gap, self._predictions = GapWatch(), PredictionWatch(config.estimator.window)
         shared = [f"load.{wheels[0].name}" for wheels in config.same_signal("load") if len(wheels) > 1]
         self._mismatch = " ".join(["model_mismatch", *shared])
         self._held = Held()
@@ -123,7 +123,7 @@ class WindowEstimator:
         self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         of_tracker = Settings(
-            settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift,
+            settings.window, settings.min_speed, settings.max_turn, settings.soil_drift,
             form=form_of(config), search_rate=settings.search_rate, search_burst=settings.search_burst,
             hop=settings.hop,
         )  # fmt: skip
@@ -150,10 +150,11 @@ class WindowEstimator:
             self._tracker.reset()
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
+        self._watch_model(task, tracked)
         status, reason = self._status(task, tracked)
         own = posterior = None
         if fit is not None and status is not Status.INVALID:
-            own = posterior = fit.mode.posterior.widened(_widening(tracked, fit), self.prior)
+            own = posterior = fit.mode.posterior.widened(_widening(fit), self.prior)
             if fit.form is not None:
                 posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
         basis = self._basis(task, fit)
@@ -177,7 +178,8 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
-            gaps=self._model_gaps(task, fit),
+            gaps=self._predictions.gaps(self._settings.max_prediction_error),
+            prediction_error=self._predictions.shares(),
             channel_chi2=self._gap.chi2(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
@@ -246,13 +248,13 @@ class WindowEstimator:
         measured = np.where(np.isfinite(self._ceiling.limit), self._ceiling.limit, np.inf)
         return tuple(np.where(self._idle, 0.0, measured).tolist())
 
-    def _model_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
-        """The channels that have not fitted for minutes; windows with missing or poor inputs do not count."""
+    def _watch_model(self, task: WindowTask, tracked: TrackerOutput) -> None:
+        """Take a window's squares and predictions; those with missing or poor inputs do not count."""
         if task.fresh:
-            self._gap.forget()
-        if fit is not None and not task.missing and not task.poor:
-            self._gap.take(task.end, squares(fit.optimum.at, len(self.rig.wheels)))
-        return self._gap.gaps()
+            self._gap, self._predictions = GapWatch(), PredictionWatch(self._settings.window)
+        if tracked.fit is not None and not task.missing and not task.poor:
+            self._gap.take(task.end, squares(tracked.fit.optimum.at, len(self.rig.wheels)))
+            self._predictions.take(task.end, tracked.prediction)
 
     def _update_watch(self, window: Undecided) -> None:
         """Update loss of traction and watch by the last hop, with the curve of the window before."""
@@ -282,7 +284,7 @@ class WindowEstimator:
         speed, fit = self._usual_speed(window), tracked.fit
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
-        widening = _widening(tracked, fit)
+        widening = _widening(fit)
         return UncertainModel.of(
             self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, widening, fit.form
         )
@@ -361,8 +363,9 @@ class WindowEstimator:
             return (Status.NOT_EXCITED, "not_excited few_bins") if is_short else (Status.INVALID, "no_convergence")
         failure = self._failure(tracked)
         if fit is None or failure is not None:
-            status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
-            return status, self._mismatch if failure == "model_mismatch" else "no_convergence"
+            return Status.INVALID, "no_convergence"
+        if self._predictions.error() > self._settings.max_prediction_error:
+            return Status.DEGRADED, self._mismatch
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
@@ -383,13 +386,11 @@ class WindowEstimator:
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
     def _failure(self, tracked: TrackerOutput) -> str | None:
-        """Kind of failure of a solve: not_finite, model_mismatch or no_convergence; None for none."""
+        """Kind of failure of a solve: not_finite or no_convergence; None for none."""
         fit = tracked.fit
-        if not tracked.mismatch:
+        if not tracked.mismatch or (fit is not None and fit.converged):
             return None
-        if fit is None:
-            return "model_mismatch" if tracked.search_ended else "not_finite"
-        return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
+        return "no_convergence" if fit is not None or tracked.search_ended else "not_finite"
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:
     """Which soil a window is of, and why."""
@@ -403,6 +404,6 @@ def _gated(tracked: TrackerOutput) -> str:
     return "standstill" if tracked.standstill >= tracked.turning else "turning"
 
 
-def _widening(tracked: TrackerOutput, fit: Fit) -> float:
-    """Factor of a fit's covariance: its reduced chi-square where the window does not fit, else 1."""
-    return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
+def _widening(fit: Fit) -> float:
+    """Return the factor of a fit's covariance: its chi-square per residual where that is more than earlier ones."""
+    return max(fit.chi2, 1.0)
