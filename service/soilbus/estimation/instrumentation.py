@@ -261,6 +261,25 @@ def completed(window: Window, rig: Rig) -> Window:
     return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
 
 
+def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
+    """Return a window that was completed for a rig, completed for another one with the same channels."""
+    given, observations = rig.instrumentation, window.observations
+    if other is rig or given is None or observations is None:
+        return window
+    W, variance, raw = len(rig.wheels), dict(window.variance), {}
+    columns = {
+        "torque": (observations.torque, observations.torque_var),
+        "load": (observations.value[:, :W], observations.variance[:, :W]),
+        "speed": (observations.value[:, W : 2 * W], observations.variance[:, W : 2 * W]),
+    }
+    for quantity, (values, variances) in columns.items():
+        raw[quantity], variance[quantity] = (np.full(values.shape, np.nan) for _ in range(2))
+        for i, row in enumerate(getattr(given, quantity)):
+            if row.kind == "channel":
+                raw[quantity][:, row.at], variance[quantity][:, row.at] = values[:, i], variances[:, i]
+    return completed(replace(window, variance=variance, observations=None, **raw), other)
+
+
 def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
     """A completed window with other speeds (N, W) of the wheels."""
     given, observations = rig.instrumentation, window.observations

@@ -335,6 +335,13 @@ class Measurements:
         return self._known
 
     @property
+    def measured_rows(self) -> NDArray[np.bool_]:
+        """Which residuals (m,) of an instant are of a sensor, and not of how a differential shares torque."""
+        given, rest = self.rig.instrumentation, self._n_residuals - self.n_wheels
+        torques = [True] * self.n_wheels if given is None else [row.kind == "channel" for row in given.torque]
+        return np.array([*torques, *[True] * rest])
+
+    @property
     def measured_latents(self) -> NDArray[np.bool_]:
         """Which latents (2 W + 1,) a sensor measures, and no geometry or coupling computes."""
         given, W = self.rig.instrumentation, self.n_wheels

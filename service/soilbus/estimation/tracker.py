@@ -345,6 +345,21 @@ class Tracker:
         """Take the gains of the last run, `elapsed` seconds ago, as prior now and after each reset."""
         self._last_run = gaussian, elapsed
 
+    def start_from(self, other: Tracker, t: float) -> None:
+        """Take the soil that another tracker knows as the prior from `t` [s] on: the machine changed, not the ground."""
+        known = other.newest_posterior
+        if known is None:
+            return
+        gains = self._initial_gain_std()
+        covariance = np.zeros((_SOIL + len(gains),) * 2)
+        covariance[:_SOIL, :_SOIL] = known.covariance[:_SOIL, :_SOIL]
+        covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] = gains**2
+        self._posteriors = [(t, Gaussian(known.soil, np.zeros(len(gains)), covariance))]
+        self._components = other._components
+
+    def _initial_gain_std(self) -> Array:
+        return gain_errors(self.rig, self.model, self.free)[1]
+
     def reset(self) -> None:
         """Forget all windows."""
         self._state = SoilState()
@@ -409,7 +424,7 @@ class Tracker:
 
     def _problem(self, window: Window) -> ObservationModel:
         speed, turn = self.settings.min_speed, self.settings.max_turn
-        window = self._components.scaled(window)
+        window = self._components.scaled(window, self.rig)
         problem = ObservationModelWithEffects(window, self.rig, self.model, speed, turn, self.effects, self.free)
         problem.work = self._budget.work
         return problem

@@ -20,15 +20,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.estimation.instrumentation import Row
 from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, Optimum
 from soilbus.estimation.options import VarianceOptions
-from soilbus.estimation.window import Window
+from soilbus.estimation.window import Rig, Window
 
 KINDS = {
     "torque": ("torque",), "draft": ("draft", "pitch", "acceleration"), "sinkage": ("sinkage",),
-    "load": ("load",), "speed": ("speed",), "ground_speed": ("ground_speed",),
+    "load": ("load",), "speed": ("speed",), "ground_speed": ("ground_speed",), "computed_load": (),
 }  # fmt: skip
-"""Quantities whose variance each factor scales."""
+"""Quantities whose variance each factor scales; that of loads which no cell measures is of the rig."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +48,25 @@ class VarianceComponents:
     factor: Mapping[str, float] = field(default_factory=dict)
     weight: float = 0.0
 
-    def scaled(self, window: Window) -> Window:
-        """Return the window with the sensors' variances times their factors."""
+    def scaled(self, window: Window, rig: Rig) -> Window:
+        """Return the window with the variances of sensors, and of loads that none measures, times their factors."""
         variance = dict(window.variance)
         for kind, factor in self.factor.items():
             for quantity in KINDS[kind]:
                 variance[quantity] = factor * variance[quantity]
-        return replace(window, variance=variance)
+        given, observations = rig.instrumentation, window.observations
+        if given is not None and observations is not None:
+            torque = [self._of_row(row, "torque", "") for row in given.torque]
+            load = [self._of_row(row, "load", "computed_load") for row in given.load]
+            speed = [self._of_row(row, "speed", "") for row in given.speed]
+            latents = np.array([*load, *speed, self.factor.get("ground_speed", 1.0)])
+            observations = observations._replace(
+                torque_var=observations.torque_var * torque, variance=observations.variance * latents
+            )
+        return replace(window, variance=variance, observations=observations)
+
+    def _of_row(self, row: Row, measured: str, computed: str) -> float:
+        return self.factor.get(measured if row.kind == "channel" else computed, 1.0)
 
     def after(self, found: Mapping[str, float], whole: bool = False) -> VarianceComponents:
         """Return the components after a window whose corrections are `found` times those expected; whole: replaced."""
@@ -86,14 +99,18 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     shares = variance * np.einsum("nml,nmk,nkl->nl", A, inverse, A, optimize=True)
     of_rows = row_var * np.einsum("nmm->nm", inverse)
     known = problem.known
+    known = known & problem.measured_rows
     rows = np.where(known, np.sqrt(row_var) * e, 0.0), np.where(known, of_rows, 0.0)
-    latents = np.sqrt(variance) * by_latents, np.where(problem.measured_latents, shares, 0.0)
+    corrections, measured = np.sqrt(variance) * by_latents, problem.measured_latents
+    latents = corrections, np.where(measured, shares, 0.0)
+    computed = corrections, np.where(measured, 0.0, shares)
     layout, found = problem.layout, {}
     for kind, (values, expected), columns in (
         ("torque", rows, layout.torques),
         ("draft", rows, slice(layout.balance, layout.balance + 1)),
         ("sinkage", rows, layout.sinkages),
         ("load", latents, layout.loads),
+        ("computed_load", computed, layout.loads),
         ("speed", latents, layout.speeds),
         ("ground_speed", latents, slice(layout.ground_speed, layout.ground_speed + 1)),
     ):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,21 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import NO_LOSS, bins_of_a_moment, idle, motions, observed, slope_felt
+from soilbus.decision.traction_loss import (
+    NO_LOSS,
+    bins_of_a_moment,
+    disengaged,
+    idle,
+    motions,
+    observed,
+    shared_out,
+    slope_felt,
+)
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
-from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
+from soilbus.estimation.instrumentation import recompleted
 from soilbus.estimation.measurements import MASS_GAIN, gains_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
@@ -129,12 +140,33 @@ class WindowEstimator:
         )  # fmt: skip
         if config.table is not None:
             of_tracker = replace(of_tracker, min_rows=1)  # a table's rows are chosen with care, and few
-        self._tracker = tracker_of(self.rig, self.prior, self.model, of_tracker, *self._effects_and_parameters)
+        self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
+        self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
+        self._driven_rig = self.rig
+        self._tracker = self._new_tracker()
 
     @property
     def tracker(self) -> Tracker:
         """The tracker, which carries soil and gains from window to window."""
         return self._tracker
+
+    def _new_tracker(self) -> Tracker:
+        effects, free = self._effects_and_parameters
+        return self._tracker_of(self._driven_rig, effects=effects, free=free)
+
+    def _follow_clutch(self, task: WindowTask) -> Window:
+        """The window's data since an axle was engaged or disengaged; the tracker is of the machine as it is now."""
+        since = -math.inf if task.fresh else task.end - self._settings.hop
+        apart = disengaged(task.window, self.rig, since, self._apart)
+        if (apart != self._apart).any():
+            self._apart, self._engaged_at = apart, since
+            self._driven_rig = with_disengaged(self.config, self.rig, apart)
+            before, self._tracker = self._tracker, self._new_tracker()
+            self._gain_names, self._gain_std = gains_of(self._driven_rig)
+            self._tracker.start_from(before, since)
+            self._predictions = PredictionWatch(self._settings.window)
+        window = task.window.rows(np.flatnonzero(task.window.t > self._engaged_at))
+        return recompleted(window, self.rig, self._driven_rig)
 
     def solve(self, task: WindowTask) -> WindowResult:
         """Result of one window, with decision and watch; windows in their order."""
@@ -148,7 +180,8 @@ class WindowEstimator:
         """Soil and status of one window; windows in their order."""
         if task.fresh:
             self._tracker.reset()
-        tracked = self._tracker.estimate(task.window, task.end)
+            self._engaged_at = -math.inf
+        tracked = self._tracker.estimate(self._follow_clutch(task), task.end)
         fit = tracked.fit
         self._watch_model(task, tracked)
         status, reason = self._status(task, tracked)
@@ -183,7 +216,7 @@ class WindowEstimator:
             channel_chi2=self._gap.chi2(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
-            z_driven=None if fit is None or posterior is None else sinkage_range(fit, self.rig),
+            z_driven=None if fit is None or posterior is None else sinkage_range(fit, self._driven_rig),
             search_ended=tracked.search_ended,
             soil_change=_soil_change(tracked),
             shows_strength=fit is not None and self._shows_strength(fit),
@@ -195,7 +228,7 @@ class WindowEstimator:
         demand = present_demand(window, rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
         corrections = Corrections(self._torque_ceiling(task, window), effects)
-        result, limit = replace(result, corrections=corrections), corrections.torque_limit(task.torque_limit)
+        result, limit = replace(result, corrections=corrections), corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig))
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
@@ -303,10 +336,10 @@ class WindowEstimator:
     def _with_estimated_mass(self, tracked: TrackerOutput) -> Rig:
         """The rig with the mass m / (1 + gain of the weight) that the window estimates, where no load cell does."""
         if self.rig.chassis is None or MASS_GAIN not in self._gain_names:
-            return self.rig
+            return self._driven_rig
         error = self._gain(tracked, MASS_GAIN)
         chassis = replace(self.rig.chassis, mass=self.rig.chassis.mass / (1.0 + error.value))
-        return replace(self.rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
+        return replace(self._driven_rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
 
     def _gain(self, tracked: TrackerOutput, name: str) -> Estimate:
         """A sensor's or row's gain error: posterior of the fit, else the prior."""
@@ -370,7 +403,7 @@ class WindowEstimator:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
-        if lacks := lacking(fit, self.rig, self._settings):
+        if lacks := lacking(fit, self._driven_rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
 
