@@ -335,6 +335,11 @@ class Measurements:
         return self._known
 
     @property
+    def wheel_torque(self) -> Array:
+        """Torques (N, W) [N m] of the wheels by the rows of torques; differentials share equally."""
+        return self.torque if self._torque_matrix is None else np.linalg.solve(self._torque_matrix, self.torque.T).T
+
+    @property
     def measured_rows(self) -> NDArray[np.bool_]:
         """Which residuals (m,) of an instant are of a sensor, and not of how a differential shares torque."""
         given, rest = self.rig.instrumentation, self._n_residuals - self.n_wheels

@@ -44,6 +44,8 @@ SIDE = np.array([-1.0, 1.0, 1.0, 1.0])
 """Which way the literature's forms lie from the configured one: the peak nearer to the axle, the exit behind it."""
 OF_SQUARE = np.array([1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0, 1.0 / 4.0])
 """Variance over the square of the range: even between its ends (1/12), or either end as likely (1/4: a shear law)."""
+OPEN = 0.5
+"""Probability that the contact is of another form than the configured one, which is itself a published form."""
 _SOIL = len(PARAMETERS)
 
 
@@ -89,12 +91,13 @@ class FormPosterior:
     def log_covariance(self) -> Array:
         """What the form adds to the covariance (6, 6) of the soil's logarithms about their mean."""
         of_soil = self.by_form[:_SOIL]
-        return np.asarray(of_soil @ self.covariance @ of_soil.T)
+        spread = OPEN * self.covariance + OPEN * (1.0 - OPEN) * np.outer(self.mean, self.mean)
+        return np.asarray(of_soil @ spread @ of_soil.T)
 
     @property
     def log_shift(self) -> Array:
         """From the soil's logarithms on the configured form to their mean over all forms (6,)."""
-        return np.asarray(self.by_form[:_SOIL] @ self.mean)
+        return np.asarray(OPEN * self.by_form[:_SOIL] @ self.mean)
 
 
 def with_form_step(model: WheelModel, step: Array) -> WheelModel:

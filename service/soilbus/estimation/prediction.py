@@ -41,7 +41,7 @@ def prediction_shares(problem: ObservationModel, at: Linearisation, since: float
     W, known, t = problem.n_wheels, problem.known[new], problem.t[new]
     residual = np.where(known, at.rows[:, RESIDUAL].reshape(n, m)[new], 0.0)[:, : W + 1]
     known = known[:, : W + 1]
-    thrust = (np.abs(problem.torque[new]) / problem.rig.radius).sum(axis=1)
+    thrust = np.abs(problem.wheel_torque[new] / problem.rig.radius).sum(axis=1)
     size = np.column_stack([np.where(known[:, :W], problem.torque[new], 0.0), np.where(known[:, W], thrust, 0.0)])
     errors, sizes, counts = (block_sums(values, t, block) for values in (residual, size, known.astype(float)))
     counts = np.maximum(counts, 1.0)
