@@ -32,7 +32,7 @@ class Mutation(NamedTuple):
     tests: tuple[str, ...]
 
 
-STORIES = "tests/validation/test_stories.py"
+STORIES = "tests/lab/test_stories.py"
 DECISION = "tests/daemon/test_decision.py"
 MUTATIONS = (
     Mutation(

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-import soilbus.validation.bench as bench
+import soilbus.trials.bench as bench
 from soilbus.cli.main import main
-from soilbus.validation.bench import growth, paper, service, window
-from soilbus.validation.bench.figure import Figure, in_turn
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.trials.bench import growth, on_log, paper, window
+from soilbus.trials.bench.figure import Figure, in_turn
 
 TARGETS = {
     "decode_speedup": ">= 20",
@@ -33,11 +34,10 @@ def small(monkeypatch):
     """The bench of a short recording, each time taken once."""
     monkeypatch.setattr(bench, "RECORDING_TIME", 13.0)
     monkeypatch.setattr(paper, "SOLVES", 20)
-    for module in (paper, service, window, growth):
+    for module in (paper, on_log, window, growth):
         monkeypatch.setattr(module, "ROUNDS", 1)
     monkeypatch.setattr(window, "SOILS", ("loam",))
     monkeypatch.setattr(window, "EXACT_AND_ROUGH", window.EXACT_AND_ROUGH[:1])
-    monkeypatch.setattr(growth, "WHEELS", (1, 2))
     monkeypatch.setattr(growth, "WINDOW_LENGTHS", (4.0, 8.0))
 
 
@@ -58,7 +58,7 @@ def test_every_figure_is_in_the_json_and_beside_its_target_in_the_table(small, t
         assert ("missed" in line) == (not detail["met"])
     assert results["details"]["window_ms"]["what"].startswith("median of 3 windows")
     assert results["window_ms"] < results["service_window_ms"]
-    assert sum(line.split()[0] in ("1", "2") for line in lines if line) == 2  # a line for each number of wheels
+    assert sum(line.split()[0] in ("2", "4") for line in lines if line) == 2  # a line for each number of wheels
 
 
 def test_json_to_stdout_is_nothing_but_json(monkeypatch, capsys):
@@ -105,9 +105,11 @@ def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known)
     assert [*np.array(["k_c", "k_phi", "n", "phi", "c", "K"])[problem.prior.free]] == [
         x for x in ("k_c", "k_phi", "n", "phi", "c", "K") if x != exact
     ]
-    assert problem.start._asdict()[rough] == pytest.approx(1.25 * window.soil_named(name)._asdict()[rough])
+    assert problem.prior.median[PARAMETERS.index(rough)] == pytest.approx(
+        1.25 * window.soil_named(name)._asdict()[rough]
+    )
     ours = window.fit_window(*problem)
-    peer = window.by_finite_differences(problem)
+    peer = window.by_finite_differences(*problem)
     assert window.distance(problem, ours, peer) < 0.02
 
 
@@ -151,15 +153,10 @@ def test_an_unwritable_place_is_told_before_the_long_work(tmp_path, monkeypatch,
 
 
 def test_windows_grow_as_they_are_said_to():
-    for wheels in (1, 2, 8):
+    for wheels in growth.WHEELS:
         for (problem, _), length in zip(growth.problems(wheels), growth.WINDOW_LENGTHS, strict=True):
             assert (problem.n, problem.n_wheels) == (10 * length, wheels)
             assert problem.n_rows == problem.n * (2 * wheels + 1)  # torque and sinkage of each wheel, one balance
-
-
-def test_a_straight_line_is_found_and_its_slope_is_the_cost_of_a_wheel_instant():
-    size = np.array([50.0, 200.0, 800.0, 3200.0])
-    assert growth.line(size, 1e-3 + 3e-6 * size) == pytest.approx((1e-3, 3e-6))
 
 
 def test_times_are_taken_in_turn_and_the_least_counts():

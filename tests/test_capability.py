@@ -1,4 +1,4 @@
-"""Capability against brute force (nested scipy root finding) and against Monte Carlo."""
+"""Capability against brute force (nested scipy root finding)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation.random_soils import assessed as assessed_within
-from soilbus.validation.random_soils import by_draws, figures
-from soilbus.validation.statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
+from statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)
@@ -350,37 +348,6 @@ def fitted(name: str, slip: Swing) -> Posterior:
     fit = fit_window(ObservationModel(store.window(0.0, 10.0), RIG, model_of(CONFIG), 0.2), prior_of(CONFIG))
     assert fit is not None
     return fit.posterior
-
-
-@pytest.mark.parametrize(
-    ("name", "slip", "limit"),
-    [
-        ("loam", Swing(0.05, 0.40), 2400.0),
-        ("loam", Swing(0.08, 0.15), 1100.0),
-        ("wet_clay", Swing(0.05, 0.40), 2400.0),
-        ("lete_sand", Swing(0.05, 0.40), 1100.0),
-        ("clayey_soil_38", Swing(0.05, 0.40), 2400.0),
-        ("upland_sandy_loam_51", Swing(0.08, 0.15), 2400.0),
-        ("heavy_clay_40", Swing(0.05, 0.40), 1100.0),
-    ],
-)
-def test_means_and_deviations_equal_monte_carlo(name, slip, limit):
-    posterior = fitted(name, slip)
-    demand = Demand(0.5 * assessed_within(posterior, limit, None).max_draft.value, 20.0, 0.02)
-    ours = assessed_within(posterior, limit, demand)
-    with by_draws():
-        drawn = assessed_within(posterior, limit, demand)
-    expected, found = figures(drawn), {name: e for name, e in figures(ours).items() if e.std > 1e-9}
-    assert set(found) <= set(expected)
-    assert len(found) >= 8
-    for quantity, estimate in found.items():
-        assert estimate.value == pytest.approx(expected[quantity].value, rel=0.02), quantity
-        allowed = max(0.10 * expected[quantity].std, 0.0015 * abs(expected[quantity].value))
-        assert estimate.std == pytest.approx(expected[quantity].std, abs=allowed), quantity
-    for mean, std in (("pull", "pull_std"), ("torque", "torque_std")):
-        of_ours, of_drawn = (getattr(able.over_slip, mean) for able in (ours, drawn))
-        assert of_ours == pytest.approx(of_drawn, rel=0.02, abs=0.005 * np.abs(of_drawn).max())
-        assert getattr(ours.over_slip, std) == pytest.approx(getattr(drawn.over_slip, std), rel=0.10)
 
 
 def test_the_spread_of_the_largest_draft_equals_that_of_brute_force():

@@ -81,7 +81,6 @@ def test_no_module_of_the_wheel_needs_an_extra_to_be_imported() -> None:
     foreign = {module: at_its_head(module) - sys.stdlib_module_names for module in sorted(modules)}
     allowed = needed - {"python-can"} | {"can"}
     assert {module: found - allowed for module, found in foreign.items() if found - allowed} == {}
-    assert {"soilbus.validation.peers.learned", "soilbus.validation.fuzz.command"} <= modules
 
 
 def test_no_module_that_the_daemon_can_load_imports_scipy_even_inside_a_function() -> None:

@@ -145,6 +145,7 @@ def test_the_wheel_has_the_types_the_version_and_its_own_requirements(built: Pat
         (metadata,) = (n for n in names if n.endswith(".dist-info/METADATA"))
         said = email.message_from_bytes(package.read(metadata))
     assert "soilbus/py.typed" in names
+    assert not {part for name in names for part in name.split("/")} & {"tests", "lab", "validation"}
     assert said["Version"] == soilbus.__version__
     needed = [text for text in said.get_all("Requires-Dist", []) if "extra ==" not in text]
     assert any(re.match(r"scipy\b", text) for text in needed)

@@ -9,9 +9,9 @@ from contextlib import redirect_stdout
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.validation import paper_report
-from soilbus.validation.paper import EXACT, SIMPSON, WheelEquations
-from soilbus.validation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
+from soilbus.trials import paper_report
+from soilbus.trials.paper import SIMPSON
+from soilbus.trials.paper_tables import RUNS
 
 
 @pytest.fixture(scope="module")
@@ -54,36 +54,11 @@ def test_sections_and_their_numbers(output):
     holds = re.sub(r"\s+", " ", " ".join(section(output, "What holds")))
     assert "8 of the 8" in holds
     assert "K_L = 108 instead of 645" in holds
-    assert "at least 559 %" in holds
-    other = "\n".join(section(output, "Other data"))
-    assert re.search(r"A4 as printed, in the solver only +none +none +none", other)
-    assert re.search(r"exact integrals, rational shear +13\.980, 108\.40, 0\.3645", other)
-    torques = "\n".join(section(output, "Figure 13"))
-    assert re.search(r"sinkage 0\.05 m +219 +934 +278 +1182", torques)
-    noise = "\n".join(section(output, "Noise"))
-    assert noise.count("100 instants: RMS error") == noise.count("one instant: bound") == 4
     widths = "\n".join(section(output, "k_c and k_phi"))
     assert re.search(r"paper's Table 6 +635\.52 +596\.18 +35\.41 +19 +517\.5 +3\.6", widths)
 
 
-def test_every_correction_shows_its_effect(output):
-    text = "\n".join(section(output, "Corrected in the paper"))
-    flat = re.sub(r"\s+", " ", text)
-    for number in (
-        "DP = -22.3 N instead of +79.6 N (integrals: +77.4 N)",  # eq. 27
-        "T = 340 N m instead of",  # eq. 14
-        "0.67 against 0.87 of the strength",  # fig. 2
-        "T = 219 N m against W = 1633 N, DP = +192 N, T = 278 N m",
-        "j/(j+K) <= 0.67",  # section 2.4
-        "635.522 against 644.9 is 1.45 %",
-        "k_c = 35.41 instead of 43.68",
-        "phi = 14.000, K_L = 596.37, n = 0.8500",  # table 7
-    ):
-        assert number in flat
-    assert text.count("effect:") == text.count("printed:") == text.count("must be:") == 12
-
-
-@pytest.mark.parametrize("wrong", [["--sinkage", "1"], ["--sinkage", "deep"], ["--sinkage", "nan"], ["--seed", "-1"]])
+@pytest.mark.parametrize("wrong", [["--sinkage", "1"], ["--sinkage", "deep"], ["--sinkage", "nan"]])
 def test_wrong_usage_is_one_line(wrong, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["paper", *wrong])
@@ -95,21 +70,19 @@ def test_the_verdicts_follow_from_the_figures(output, monkeypatch):
     """Where the figures are others, so are the verdicts."""
     said = re.sub(r"\s+", " ", " ".join(section(output, "What holds")))
     for verdict in (
-        "Convergence holds", "are not the method's", "The accuracy does not hold", "(conclusion 3) does not hold",
-        "fit neither one load nor one sinkage", "Real time holds",
+        "Convergence holds", "are not the method's", "The accuracy does not hold",
+        "Real time holds",
     ):  # fmt: skip
         assert verdict in said
-    clay = WheelEquations(WET_CLAY.at(0.05), EXACT).forces(WET_CLAY.truth).T
-    loam = WheelEquations(SANDY_LOAM.at(0.05), EXACT).forces(SANDY_LOAM.truth).T
     slow = [run._replace(seconds=1e-9) for run in RUNS]
     for name, value in (
-        ("K_L_bound", lambda *_: 1e-4), ("TORQUE_ON_CLAY", clay), ("TORQUE_ON_LOAM", loam), ("RUNS", slow),
+        ("RUNS", slow),
         ("MAX_SOLUTION_ERROR", 0.0), ("EXACT", SIMPSON),
     ):  # fmt: skip
         monkeypatch.setattr(paper_report, name, value)
     said = " ".join(paper_report.what_holds(0.05))
     for verdict in (
-        "Convergence does not hold", "The accuracy holds", "(conclusion 3) holds", "fit one sinkage",
+        "Convergence does not hold", "The accuracy holds",
         "Real time does not hold",
     ):  # fmt: skip
         assert verdict in said

@@ -67,7 +67,7 @@ def test_a_reader_that_has_seen_enough_is_no_failure(log):
     [
         (6, ("check", "--config", str(TRACTOR))),
         (1, ("watch", "--set", "bus.interface=virtual", "--seconds", "0.1")),  # one line for what stays the same
-        (6, ("montecarlo", "--help")),
+        (6, ("decisions", "--help")),
     ],
 )
 def test_a_terminal_that_knows_only_ascii_gets_all_it_can_show(least, words):
@@ -177,7 +177,7 @@ def test_workers_die_with_a_killed_parent(code, method, count, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_of_the_whole_group_ends_all_without_a_word(number):
-    parent = started(*PROGRAM, "montecarlo", "--windows", "40")
+    parent = started(*PROGRAM, "decisions", "--drives", "40")
     until(lambda: len(children(parent.pid)) >= 2 or (os.cpu_count() or 1) < 2)
     working = children(parent.pid)
     os.killpg(parent.pid, number)

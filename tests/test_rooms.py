@@ -64,8 +64,8 @@ def test_the_arrows_make_no_circle() -> None:
         left = {room: lower for room, lower in left.items() if room not in lowest}
 
 
-def test_the_daemon_knows_neither_simulator_nor_validation() -> None:
-    assert below("daemon").isdisjoint({"simulator", "validation", "report", "diagnosis"})
+def test_the_daemon_knows_neither_simulator_nor_trials() -> None:
+    assert below("daemon").isdisjoint({"simulator", "trials", "report", "diagnosis"})
     assert "can" not in below("estimation") | below("diagnosis")
     assert below("terra") == below("config") == set()
 
@@ -80,3 +80,11 @@ def test_modules_outside_of_the_rooms_know_no_room_but_the_command_line() -> Non
 
 def test_the_library_is_what_nothing_inside_rests_on() -> None:
     assert not any(lower == "api" for _, lower in ARROWS)
+
+
+def test_no_file_of_the_package_imports_the_tests() -> None:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not [name for name in names if name.partition(".")[0] == "tests"], path

@@ -23,7 +23,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
-from soilbus.validation.statics import WEIGHT, brute
+from statics import WEIGHT, brute
 
 RIG = rig_of(reference_configuration())
 MODEL = WheelModel(nodes=FAST_NODES)

@@ -22,7 +22,6 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.fleet import Fault, fleet, is_true, names_given, rivalry
 
 GAIN = CATALOGUE["draft_gain"]
 
@@ -90,25 +89,6 @@ def test_how_common_an_effect_is_agrees_with_what_the_other_vehicles_have():
     share = something * (others + 1.0) / (others + names)
     odds = chances / (1.0 - chances) * names * share / (1.0 - something)
     assert after == pytest.approx(odds / (1.0 + odds), abs=1e-4)
-
-
-def test_a_fleet_of_the_blind_generator():
-    fault, of_type = Fault("wheel_load_offset:one", 600.0), Fault("drivetrain_loss:constant", 60.0)
-    hidden = fleet(5, {1: fault}, of_type, vehicles=5, logs=1, seconds=40.0)
-    names = names_given(hidden)
-    assert {(one.effect, one.vehicle) for one in names} == {("drivetrain_loss", None), ("wheel_load_offset", 1)}
-    assert all(is_true(one, hidden) for one in names)
-
-
-def test_what_logs_can_show_of_a_fault_depends_on_its_best_rival():
-    clear = rivalry(31, 0, Fault("wheel_load_offset:one", 500.0, 1))
-    assert clear.fall > 2.0 * clear.rival_fall > 0.0
-    assert clear.probability > 0.99
-    imitated = rivalry(31, 3, Fault("draft_offset:constant", 600.0, 1))
-    assert imitated.rival == "bulldozing"
-    assert imitated.fall > 300.0  # far better than nothing
-    assert abs(imitated.fall - imitated.rival_fall) < 3.0
-    assert max(imitated.probability, imitated.untempered) < 0.6
 
 
 def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):

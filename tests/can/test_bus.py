@@ -14,7 +14,7 @@ import pytest
 from soilbus.can.bus import BusError, LiveBus, ask_for_buffer, open_bus
 from soilbus.can.publish import Frame
 from soilbus.daemon.bus_health import health_text
-from soilbus.validation.fakes import FakeClock, ScriptedBus
+from tests.lab.fakes import FakeClock, ScriptedBus
 
 FRAME = Frame(0x18FF609A, True, bytes(8))
 SO_RCVBUFFORCE = 33

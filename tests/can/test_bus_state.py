@@ -7,7 +7,7 @@ import pytest
 
 from soilbus.can.bus import LiveBus
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
-from soilbus.validation.fakes import FakeClock, ScriptedBus
+from tests.lab.fakes import FakeClock, ScriptedBus
 
 CONTROLLER, PROTOCOL, NO_ACK, BUS_OFF, BUS_ERROR, RESTARTED, COUNTERS = 0x4, 0x8, 0x20, 0x40, 0x80, 0x100, 0x200
 

@@ -24,7 +24,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.bench.service import seconds_of_windows
+from soilbus.trials.bench.on_log import seconds_of_windows
 
 SECONDS = 24.0
 VALUE, STD = 0.05, 0.1

@@ -27,7 +27,7 @@ from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
-from soilbus.validation.fakes import feed_message
+from tests.lab.fakes import feed_message
 
 REAR_DRIVEN = reference_configuration(path=REFERENCES["tractor-2wd"])
 TWO_MOTORS = reference_configuration(path=REFERENCES["tractor-axles"])

@@ -20,8 +20,8 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.validation.fakes import feed_message
-from soilbus.validation.stories.onlooker import good_tracked, of_soft_ground, tracked_at
+from tests.lab.fakes import feed_message
+from tests.lab.stories.onlooker import good_tracked, of_soft_ground, tracked_at
 
 CONFIG = reference_configuration()
 

@@ -25,7 +25,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
-from soilbus.validation.fakes import feed_message
+from tests.lab.fakes import feed_message
 
 TRUTH = reference_configuration(path=REFERENCES["tractor-2wd"])
 

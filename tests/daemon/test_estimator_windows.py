@@ -16,7 +16,7 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
-from soilbus.validation.driven_windows import tasks
+from tests.lab.driven_windows import tasks
 
 FORMLESS = [f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")]
 

@@ -34,7 +34,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.sensors import measure
-from soilbus.validation.fakes import Bench, ScriptedBus, feed_message
+from tests.lab.fakes import Bench, ScriptedBus, feed_message
 
 CONFIG = reference_configuration()
 IN = load_databases(CONFIG)

@@ -1,4 +1,4 @@
-"""No path to GO: what one drive shows; random ones are in soilbus.validation.stories.
+"""No path to GO: what one drive shows; random ones are in tests.lab.stories.
 
 The wire of `onlooker` plays the last moments of a good drive over and over, at 10 Hz, and spoils them as asked.
 What it knows of its own deliveries judges every Traversability frame that the service sends.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from soilbus.decision.traversability import Status
-from soilbus.validation.stories.onlooker import CONFIG, MOMENTS, Drive, good_moment, good_tracked
+from tests.lab.stories.onlooker import CONFIG, MOMENTS, Drive, good_moment, good_tracked
 
 LEAD = 6.5
 """Seconds of good frames after which go is due."""

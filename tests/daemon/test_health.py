@@ -17,7 +17,7 @@ from soilbus.daemon.health import Health
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, drive_messages
+from tests.lab.fakes import Bench, FakeClock, HeldExecutor, drive_messages
 
 WINDOW = 8.0
 CONFIG = reference_configuration([f"estimator.window={WINDOW}"])

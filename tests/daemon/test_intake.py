@@ -18,7 +18,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.validation.fakes import feed_message
+from tests.lab.fakes import feed_message
 
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 START = 1_700_000_000.0

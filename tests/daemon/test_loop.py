@@ -19,7 +19,7 @@ from soilbus.can.wire import MessageWire
 from soilbus.daemon.notify import Notifier
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, ScriptedBus, drive_messages
+from tests.lab.fakes import Bench, FakeClock, HeldExecutor, ScriptedBus, drive_messages
 
 DURATION = 16.0
 STAMPED = 0.001

@@ -25,7 +25,7 @@ from soilbus.decision.traversability import Status, Traversability
 from soilbus.pipeline.outputs import json_line
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import Bench, FakeClock, drive_messages
+from tests.lab.fakes import Bench, FakeClock, drive_messages
 
 CONFIG = reference_configuration()
 PATIENCE = 10.0

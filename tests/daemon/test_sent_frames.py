@@ -22,7 +22,7 @@ from soilbus.offline.replay import read_log
 from soilbus.offline.sent_frames import sent_frames
 from soilbus.simulator.play import send_in_time
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from soilbus.validation.fakes import drive_messages
+from tests.lab.fakes import drive_messages
 
 DURATION = 16.0
 DATABASE = output_database(reference_configuration())

@@ -17,7 +17,7 @@ from soilbus.daemon.state_store import Owner, read
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, InlineExecutor, ScriptedBus, drive_messages
+from tests.lab.fakes import Bench, FakeClock, HeldExecutor, InlineExecutor, ScriptedBus, drive_messages
 
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)

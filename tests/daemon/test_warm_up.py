@@ -121,7 +121,7 @@ def test_a_daemon_that_has_rehearsed_has_loaded_nothing_of_other_commands():
     assert set(statuses) == {Status.VALID}
     assert "soilbus.estimation.tracker" in modules
     rooms = {module.split(".")[1] for module in modules if module.startswith("soilbus.")}
-    assert not rooms & {"simulator", "validation", "diagnosis", "offline", "report"}
+    assert not rooms & {"simulator", "trials", "diagnosis", "offline", "report"}
     assert not {module.partition(".")[0] for module in modules} & EXTRAS
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from soilbus.daemon.work_queue import WorkQueue
-from soilbus.validation.fakes import FakeClock, HeldExecutor, InlineExecutor
+from tests.lab.fakes import FakeClock, HeldExecutor, InlineExecutor
 
 
 def test_results_come_in_their_order_with_their_ends():

@@ -11,10 +11,10 @@ from soilbus.diagnosis.search import FitCache
 from soilbus.estimation.assembly import prior_of
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.terra.wheel import Soil
-from soilbus.validation.blind.bound import bound
-from soilbus.validation.blind.cases import Case, cases
-from soilbus.validation.blind.trial import NOTHING, record_of_case, tried
-from soilbus.validation.blind.visible import driven_without_noise
+from tests.lab.blind.bound import bound
+from tests.lab.blind.cases import Case, cases
+from tests.lab.blind.trial import NOTHING, record_of_case, tried
+from tests.lab.blind.visible import driven_without_noise
 
 
 def case_of(kind: str, seed: int, number: int) -> Case:

@@ -12,9 +12,9 @@ from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.blind.cases import cases
-from soilbus.validation.blind.trial import record_of_case
-from soilbus.validation.fleet import Fault, fleet
+from tests.lab.blind.cases import cases
+from tests.lab.blind.trial import record_of_case
+from tests.lab.fleet import Fault, fleet
 
 PRIOR = prior_of(reference_configuration())
 TYRE = CATALOGUE["tyre_deflection"]

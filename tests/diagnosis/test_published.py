@@ -1,4 +1,4 @@
-"""What published points show in any case: the rest is for `python -m soilbus.validation.published_wheels` to print."""
+"""What published single-wheel points show in any case."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.validation.published_wheels.comparison import (
+from tests.lab.published_wheels import (
     configuration,
     diagnosed,
     lugs_beside_a_shifted_peak,

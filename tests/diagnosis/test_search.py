@@ -22,8 +22,8 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
-from soilbus.validation.blind.cases import cases
-from soilbus.validation.blind.trial import record_of_case
+from tests.lab.blind.cases import cases
+from tests.lab.blind.trial import record_of_case
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)

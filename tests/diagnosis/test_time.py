@@ -12,8 +12,8 @@ from soilbus.diagnosis.diagnose import diagnose
 from soilbus.estimation.assembly import prior_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.wheel import Soil
-from soilbus.validation.blind.cases import cases
-from soilbus.validation.blind.trial import record_of_case
+from tests.lab.blind.cases import cases
+from tests.lab.blind.trial import record_of_case
 
 MOST_LOOKS = 1000.0
 """Linearisations of the plain model, some 6 ms each on one quiet core, as which a diagnosis may count: 5 s."""

@@ -1,4 +1,4 @@
-"""The bound against brute force, and the estimator against the bound: `soilbus montecarlo` in small."""
+"""The bound against brute force, and the estimator against the bound: tests.lab.monte_carlo in small."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS as KNOWN
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on, wheel_forces
-from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SOILS, tasks_of, trials
+from tests.lab.cramer_rao import cramer_rao
+from tests.lab.monte_carlo import ROUGHLY_KNOWN, SOILS, tasks_of, trials
 
 MODEL = WheelModel()
 LOAD = np.array([5200.0, 4800.0, 6000.0, 5500.0])

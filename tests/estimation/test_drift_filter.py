@@ -20,8 +20,8 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation import local_optima
-from soilbus.validation.driven_windows import errors, task_of, tracker_of, windows
+from tests.lab import driven_windows
+from tests.lab.driven_windows import errors, task_of, tracker_of, windows
 
 PIECES = 5
 """Pieces of constant soil in a window, as the drift filter has them."""
@@ -171,8 +171,8 @@ def test_what_does_not_drift_stays_as_it_was(simulated):
 @pytest.mark.parametrize(("overrides", "wheels"), [((), 4), ((), 2), (("soil.k_c.std=0", "soil.c.std=0"), 4)])
 def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, wheels):
     config = reference_configuration(overrides)
-    config = config if wheels == 4 else local_optima.two_wheels(config)
-    problem, prior = local_optima.window(config, "wet_clay", seed=3), prior_of(config)
+    config = config if wheels == 4 else driven_windows.two_wheels(config)
+    problem, prior = driven_windows.observed_window(config, "wet_clay", seed=3), prior_of(config)
     before = Gaussian.of(prior, problem.gain_std)
     fit = fit_window(problem, prior, before)
     fit = replace(fit, marginalised=fit.mode.mixture(fit.mode, 0.5))

@@ -16,9 +16,9 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation import local_optima
-from soilbus.validation.driven_windows import tasks
-from soilbus.validation.monte_carlo import prior_about
+from soilbus.trials.draws import prior_about
+from tests.lab import driven_windows
+from tests.lab.driven_windows import tasks
 
 STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
 SLIPS = (0.05, 0.1, 0.2, 0.35)
@@ -32,7 +32,7 @@ def rough(soil, *more):
     """Settings by which c and K are known to 25 % and k_c to 50 %."""
     k_c = SOILS[soil].k_c
     return reference_configuration(
-        [*local_optima.c_and_K_known(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more]
+        [*driven_windows.c_and_K_known(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more]
     )
 
 
@@ -46,8 +46,8 @@ def deviations(posterior, soil):
 def of_drive(soil, sinkage, seed):
     """Deviations of a window of constant slip and loads."""
     config = rough(soil)
-    problem = local_optima.window(
-        config, soil, 10.0, local_optima.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL
+    problem = driven_windows.observed_window(
+        config, soil, 10.0, driven_windows.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL
     )
     prior = prior_about(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
     whole = with_nested_laplace(
@@ -57,7 +57,7 @@ def of_drive(soil, sinkage, seed):
 
 
 @pytest.mark.parametrize("sinkage", [True, False], ids=["sinkage", "no sinkage"])
-@pytest.mark.parametrize("soil", local_optima.KINDS)
+@pytest.mark.parametrize("soil", driven_windows.NAMES)
 def test_constant_driving_has_right_intervals(sinkage, soil):
     z = np.array([of_drive(soil, sinkage, seed) for seed in range(DRIVES)])
     held = (np.abs(z) < NORMAL_95).sum(axis=0)
@@ -67,12 +67,12 @@ def test_constant_driving_has_right_intervals(sinkage, soil):
     assert ((rms > 0.8 * low) & (rms < 1.25 * high)).all(), rms
 
 
-@pytest.mark.parametrize("soil", local_optima.KINDS)
+@pytest.mark.parametrize("soil", driven_windows.NAMES)
 def test_minutes_of_constant_driving_stay_right(soil):
     last = []
     for seed in range(2):
         config = rough(soil, "estimator.hop=5.0")
-        scenario = Scenario(80.0, (Patch(0.0, soil),), slip=local_optima.constant(SLIPS[seed + 1]), side_shift=STILL)
+        scenario = Scenario(80.0, (Patch(0.0, soil),), slip=driven_windows.constant(SLIPS[seed + 1]), side_shift=STILL)
         estimator = WindowEstimator(config)
         results = [estimator.estimate(task).result for task in tasks(config, scenario, seed)]
         last += [deviations(r.posterior, soil) for r in results[-6::5] if r.posterior is not None]
@@ -94,15 +94,15 @@ def said(soil, slip, shift, sinkage=True, overrides=(), seconds=10.0, seed=1):
 
 @pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "dry_sand"])
 def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
-    short = said(soil, local_optima.EXCITED, STILL, sinkage=False, seconds=5.0)
+    short = said(soil, driven_windows.EXCITED, STILL, sinkage=False, seconds=5.0)
     assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
     assert short.traversability.state is not State.GO
-    varied = said(soil, local_optima.EXCITED, LEANING, sinkage=False, seconds=5.0)
+    varied = said(soil, driven_windows.EXCITED, LEANING, sinkage=False, seconds=5.0)
     assert varied.bearing.std / varied.bearing.value < 0.8 * short.bearing.std / short.bearing.value
 
 
 def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else():
-    short, varied = (said("dry_sand", local_optima.EXCITED, shift, seconds=2.0) for shift in (STILL, LEANING))
+    short, varied = (said("dry_sand", driven_windows.EXCITED, shift, seconds=2.0) for shift in (STILL, LEANING))
     assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
     assert (varied.status, varied.reason) == (Status.VALID, "none")
 
@@ -110,22 +110,22 @@ def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else():
 @pytest.mark.parametrize("soil", ["loam", "lete_sand", "sandy_loam_23_michigan"])
 def test_varied_loads_with_constant_slip_lack_a_range_of_slips(soil):
     strict = ["estimator.max_tan_phi_std=0.05"]
-    still = said(soil, local_optima.constant(0.05), LEANING, overrides=strict)
+    still = said(soil, driven_windows.constant(0.05), LEANING, overrides=strict)
     assert (still.status, still.reason) == (Status.NOT_EXCITED, "not_excited slip_range")
-    varied = said(soil, local_optima.EXCITED, LEANING, overrides=strict)
+    varied = said(soil, driven_windows.EXCITED, LEANING, overrides=strict)
     assert varied.posterior.tan_phi().std < 0.6 * still.posterior.tan_phi().std
 
 
 @pytest.mark.parametrize("soil", ["wet_clay", "dry_sand", "clayey_soil_38"])
 def test_both_are_named_where_both_are_missing(soil):
     strict = ["estimator.max_tan_phi_std=0.03", "estimator.max_bearing_std=0.01"]
-    result = said(soil, local_optima.constant(0.05), STILL, sinkage=False, overrides=strict, seconds=2.0)
+    result = said(soil, driven_windows.constant(0.05), STILL, sinkage=False, overrides=strict, seconds=2.0)
     assert (result.status, result.reason) == (Status.NOT_EXCITED, "not_excited load_range slip_range")
 
 
 @pytest.mark.parametrize("soil", ["loam", "clayey_soil_38"])
 def test_the_pressure_at_the_depth_of_the_wheels_is_reported_all_the_same(soil):
-    result = said(soil, local_optima.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.01"])
+    result = said(soil, driven_windows.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.01"])
     assert result.status is Status.NOT_EXCITED
     width = 0.38
     at_wheel = result.posterior.bearing_pressure(result.sinkage["RL"], width)

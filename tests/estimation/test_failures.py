@@ -21,8 +21,8 @@ from soilbus.report.windows import summary
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
-from soilbus.validation import local_optima
-from soilbus.validation.driven_windows import tasks
+from tests.lab import driven_windows
+from tests.lab.driven_windows import tasks
 
 CONFIG = reference_configuration()
 BAD = 10
@@ -32,7 +32,7 @@ QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft")
 
 @pytest.fixture(scope="module")
 def drive():
-    scenario = Scenario(22.0, (Patch(0.0, "loam"),), slip=local_optima.EXCITED)
+    scenario = Scenario(22.0, (Patch(0.0, "loam"),), slip=driven_windows.EXCITED)
     return list(tasks(CONFIG, scenario, 3))
 
 
@@ -116,25 +116,25 @@ def test_a_replay_counts_failed_solves(drive, undisturbed):
 
 # --- two soils explain a window equally well ---
 
-TWO = local_optima.two_wheels(CONFIG)
+TWO = driven_windows.two_wheels(CONFIG)
 
 
 def results_on(config, soil, seed, seconds=11.0):
-    scenario = Scenario(seconds, (Patch(0.0, soil),), slip=local_optima.EXCITED)
+    scenario = Scenario(seconds, (Patch(0.0, soil),), slip=driven_windows.EXCITED)
     estimator = WindowEstimator(config)
     return [estimator.solve(task) for task in tasks(config, scenario, seed)]
 
 
 def test_an_ambiguous_window_says_so_and_never_go():
     config = TWO
-    problem = local_optima.window(config, "wet_clay", seed=3)
+    problem = driven_windows.observed_window(config, "wet_clay", seed=3)
     fit = fit_window(problem, prior_of(config))
     one, other = (
         fit.mode.posterior.bearing_pressure(0.02, 0.3),
         fit.second_mode.gaussian.posterior.bearing_pressure(0.02, 0.3),
     )
     assert abs(one.value - other.value) > 2.0 * one.std
-    scenario = Scenario(10.0, (Patch(0.0, "wet_clay"),), slip=local_optima.EXCITED)
+    scenario = Scenario(10.0, (Patch(0.0, "wet_clay"),), slip=driven_windows.EXCITED)
     result = WindowEstimator(config).solve(next(tasks(config, scenario, 3)))
     assert (result.status, result.reason) == (Status.NOT_EXCITED, "ambiguous")
     assert result.traversability.state is not State.GO
@@ -150,14 +150,14 @@ def test_an_ambiguous_window_says_so_and_never_go():
 
 
 def test_excited_windows_of_four_wheels_are_not_ambiguous():
-    for soil in local_optima.KINDS:
+    for soil in driven_windows.NAMES:
         for seed in range(2):
             reasons = Counter(r.reason for r in results_on(CONFIG, soil, seed, 10.0))
             assert "ambiguous" not in reasons
 
 
 def test_one_of_two_optima_becomes_no_prior():
-    scenario = Scenario(12.0, (Patch(0.0, "wet_clay"),), slip=local_optima.EXCITED)
+    scenario = Scenario(12.0, (Patch(0.0, "wet_clay"),), slip=driven_windows.EXCITED)
     estimator = WindowEstimator(TWO)
     n_ambiguous = 0
     for task in tasks(TWO, scenario, 3):

@@ -17,7 +17,7 @@ from soilbus.pipeline.outputs import json_line
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
-from soilbus.validation.driven_windows import task_of, tasks
+from tests.lab.driven_windows import task_of, tasks
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
 CONFIG = reference_configuration()

@@ -18,7 +18,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation.driven_windows import tracker_of, windows
+from tests.lab.driven_windows import tracker_of, windows
 
 K_C = PARAMETERS.index("k_c")
 CLAY = "clayey_soil_38"

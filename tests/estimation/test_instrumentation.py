@@ -35,7 +35,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil, state_on, wheel_forces
-from soilbus.validation import computed_loads
+from tests.lab import computed_loads
 
 FIELD = Path(__file__).parents[1] / "field" / "field.toml"
 PLAIN = re.sub(r'\nsinkage = "[^"]*"', "", FIELD.read_text())

@@ -12,7 +12,7 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation.windows import fit_from_soil
+from soilbus.trials.windows import fit_from_soil
 
 QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
 

@@ -14,7 +14,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on, wheel_forces
-from soilbus.validation import computed_loads
+from tests.lab import computed_loads
 
 MODEL = WheelModel()
 PARAMETERS = Soil._fields

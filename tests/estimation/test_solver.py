@@ -24,7 +24,7 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Termination, minimise
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
-from soilbus.validation.windows import fit_from_soil
+from soilbus.trials.windows import fit_from_soil
 
 BOUND_SD = 4.0
 """Prior standard deviations to which a free parameter is confined."""

@@ -34,7 +34,7 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel
-from soilbus.validation.driven_windows import errors, tracker_of, windows
+from tests.lab.driven_windows import errors, tracker_of, windows
 
 CRAWLER = Path(__file__).parents[1] / "field" / "tracked.toml"
 WITH_CELLS = (

@@ -15,7 +15,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.validation.driven_windows import B_REF, Z_REF, errors, task_of, tracker_of, windows
+from tests.lab.driven_windows import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
 SPEED = 1.5
 CROSSED = 20.0

@@ -1,4 +1,4 @@
-"""A small version of validation.soil_borders: how soon the new soil is estimated, and whether its intervals hold."""
+"""A small version of tests.lab.soil_borders: how soon the new soil is estimated, and whether its intervals hold."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from soilbus.estimation.laplace import confidence, density, longer_side
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.soil_borders import crossed, drive, first_of_tyres, first_valid, least_sd, wrong, wrong_of_tyres
+from tests.lab.soil_borders import crossed, drive, first_of_tyres, first_valid, least_sd, wrong, wrong_of_tyres
 
 SPEED = 1.5
 

@@ -13,7 +13,7 @@ from soilbus.estimation.window import Window
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
-from soilbus.validation.driven_windows import B_REF, Z_REF, tracker_of, windows
+from tests.lab.driven_windows import B_REF, Z_REF, tracker_of, windows
 
 CONFIG = reference_configuration(["estimator.hop=10.0"])
 LENGTH = CONFIG.estimator.window

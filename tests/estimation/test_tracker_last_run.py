@@ -15,7 +15,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation.driven_windows import errors, tracker_of, windows
+from tests.lab.driven_windows import errors, tracker_of, windows
 
 GAIN_CORRELATION_TIME = 86400.0
 """A gain error forgets all but 1/e in a day [s]."""

@@ -13,7 +13,7 @@ from soilbus.estimation.tracker import SearchBudget
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.validation.driven_windows import tasks
+from tests.lab.driven_windows import tasks
 
 CONFIG = reference_configuration()
 UNLIMITED = reference_configuration(["estimator.search_rate=1e9", "estimator.search_burst=1e9"])

@@ -13,7 +13,7 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.validation.driven_windows import task_of, windows
+from tests.lab.driven_windows import task_of, windows
 
 SOILS = ("loam", "wet_clay", "dry_sand", "clayey_soil_38")
 

@@ -9,7 +9,7 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
 from soilbus.terra.soils import soil_named
-from soilbus.validation.driven_windows import tasks
+from tests.lab.driven_windows import tasks
 
 CONFIG = reference_configuration()
 STEADY = {"speed": Profile([0, 90], [1.4, 1.4])}

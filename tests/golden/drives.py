@@ -17,7 +17,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
-from soilbus.validation.boggings import BoggingDrive, bogging
+from soilbus.trials.boggings import BoggingDrive, bogging
 
 SLIP = Swing(0.05, 0.40)
 

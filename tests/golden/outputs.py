@@ -20,7 +20,7 @@ from soilbus.cli.main import main
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import TRACTOR
-from soilbus.validation.blind.cases import Case, cases
+from tests.lab.blind.cases import Case, cases
 
 from .compare import rounded
 

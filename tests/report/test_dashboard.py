@@ -23,7 +23,7 @@ from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.text_charts import area, bar, sparkline
 from soilbus.report.watch import page
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import FakeClock
+from tests.lab.fakes import FakeClock
 
 SIZES = [(80, 24), (120, 40), (200, 60)]
 SMALLER = [(79, 24), (72, 20), (71, 24), (80, 19), (40, 12), (20, 6), (9, 3)]

@@ -7,9 +7,9 @@ import math
 import pytest
 from scipy.stats import chi2
 
-from soilbus.validation.bogging_trials import WarningTrial, figures
-from soilbus.validation.decisions_report import as_json, decisions_report, poisson_interval
-from soilbus.validation.verdict_trials import Reliability
+from soilbus.trials.bogging_trials import WarningTrial, figures
+from soilbus.trials.decisions_report import as_json, decisions_report, poisson_interval
+from soilbus.trials.verdict_trials import Reliability
 
 NO_CALLS = Reliability(0, 0, math.nan, math.nan, 0.0, math.nan, 0, 0, 0.0, ())
 

@@ -29,7 +29,7 @@ from soilbus.report.dashboard import Dashboard
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.watch import PlayedLog, show
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import FakeClock, ScriptedBus
+from tests.lab.fakes import FakeClock, ScriptedBus
 
 DATABASE = output_database(reference_configuration())
 BEGIN = 1.7e9

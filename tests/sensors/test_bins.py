@@ -8,7 +8,7 @@ import pytest
 from soilbus.estimation.assembly import rig_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.reference import REFERENCES, reference_configuration
-from soilbus.validation.computed_loads import Task, errors
+from tests.lab.computed_loads import Task, errors
 
 NOISE = 0.01
 """Sd of a sample of ground speed [m/s]."""

@@ -11,8 +11,8 @@ from soilbus.cli.main import main
 from soilbus.estimation.assembly import rig_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS as KNOWN
-from soilbus.validation.draft_trials import SOILS, DraftTrial, Task, draft_trials, figures, trial, true_largest_draft
-from soilbus.validation.statics import MODEL, WHEELS, brute
+from soilbus.trials.draft_trials import SOILS, DraftTrial, Task, draft_trials, figures, trial, true_largest_draft
+from statics import MODEL, WHEELS, brute
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)

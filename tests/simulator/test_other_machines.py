@@ -16,7 +16,7 @@ from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import AXLE_MOTORS, REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.sensors import fitted
 from soilbus.terra.wheel import Soil, WheelModel
-from soilbus.validation.draft_trials import true_largest_draft
+from soilbus.trials.draft_trials import true_largest_draft
 
 GRAVITY = 9.80665
 MACHINES = {"four motors": TRACTOR, "rear drive": REAR_DRIVE, "axle motors": AXLE_MOTORS}

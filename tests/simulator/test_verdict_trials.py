@@ -15,8 +15,8 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import WheelModel, sinkage, state_on
-from soilbus.validation.draft_trials import true_largest_draft
-from soilbus.validation.verdict_trials import Call, Task, reliability, trial, verdict_trials, wilson
+from soilbus.trials.draft_trials import true_largest_draft
+from soilbus.trials.verdict_trials import Call, Task, reliability, trial, verdict_trials, wilson
 
 CONFIG = reference_configuration()
 

@@ -24,9 +24,9 @@ from soilbus.simulator.sensors import measure
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil
-from soilbus.validation.boggings import largest_draft
-from soilbus.validation.statics import WEIGHT, brute_with_rolling, wheel
-from soilbus.validation.windows import torque_limits
+from soilbus.trials.boggings import largest_draft
+from soilbus.trials.windows import torque_limits
+from statics import WEIGHT, brute_with_rolling, wheel
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""

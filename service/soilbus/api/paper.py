@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from soilbus.validation.paper_report import PaperTable, paper_table
-from soilbus.validation.paper_tables import SINKAGE, START_ERRORS
+from soilbus.trials.paper_report import PaperTable, paper_table
+from soilbus.trials.paper_tables import SINKAGE, START_ERRORS
 
 __all__ = ["table"]
 

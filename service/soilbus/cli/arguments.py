@@ -76,7 +76,6 @@ EXAMPLES: Mapping[str, str] = {
     "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
     "docs": "soilbus docs systemd",
     "paper": "soilbus paper --sinkage 0.05",
-    "montecarlo": "soilbus montecarlo --windows 50 --json figures.json",
     "decisions": "soilbus decisions --drives 20 --json figures.json",
     "bench": "soilbus bench --json figures.json",
 }
@@ -273,13 +272,6 @@ def command_line() -> argparse.ArgumentParser:
         "--sinkage", type=between(0.005, 0.2), default=0.05, metavar="M",
         help="of the simulated wheels, 0.005 to 0.2 m; the paper does not print its own (default 0.05)",
     )  # fmt: skip
-    sub.add_argument("--seed", type=natural, default=1, help="of the noise (default 1)")
-
-    sub = command("montecarlo", "errors of simulated windows beside the Cramér-Rao bound", "optional")
-    sub.add_argument("--windows", type=counted, default=200, metavar="N", help="of each kind (default 200)")
-    sub.add_argument("--exact", type=natural, default=0, metavar="M", help="samples of exact posteriors (default 0)")
-    sub.add_argument("--around", type=between(0.0, 1.0), default=0.0, metavar="S", help="std of soils' log (default 0)")
-    figures(sub, "drives, noise and priors")
 
     sub = command("decisions", "what soilbus predicts, beside what simulated drives then do", "optional")
     sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each soil (default 150)")
@@ -289,10 +281,6 @@ def command_line() -> argparse.ArgumentParser:
     figures(sub, "soils, drives, noise and priors")
 
     sub = command("bench", "every performance figure beside its peer, in one run", "")
-    sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
-    sub.add_argument(
-        "--seconds", type=between(15.0, 200.0), default=120.0, metavar="S", help="of a full bus (default 120)"
-    )
     figures(sub)
     return parser
 

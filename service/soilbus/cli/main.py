@@ -21,7 +21,7 @@ DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 COMMANDS = {
     "user": ("demo", "init", "run", "check", "watch", "completion", "docs"),
     "engineer": ("replay", "simulate", "diagnose", "effects", "batch"),
-    "lab": ("paper", "montecarlo", "decisions", "bench"),
+    "trials": ("paper", "decisions", "bench"),
 }
 """Each file of commands, loaded when one of them is asked for; a command is the function of that name."""
 

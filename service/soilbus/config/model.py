@@ -684,7 +684,7 @@ class Estimator(_Section):
     """Samples are averaged over bins of this length before the fit; by default 0.04 s where wheels share a torque
     behind an open or limited differential.  There the lighter wheel slips more, at 1.5 to 3 Hz, and torque at a mean
     slip is not the mean torque: with loads that shake by 12 %, 73 to 87 % of the intervals of n hold with 0.1 s, 87 to
-    100 % with 0.04 s (`python -m soilbus.validation.computed_loads`)."""
+    100 % with 0.04 s (`python -m tests.lab.computed_loads`)."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
@@ -765,7 +765,7 @@ class Warning(_Section):
     """When soilbus warns of immobilisation from slip and speed alone, without any estimate of the soil.
 
     Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
-    thesis, 2023, ch. 7), with eleven others looked at: `python -m soilbus.validation.snow`.
+    thesis, 2023, ch. 7), with eleven others looked at: `python -m tests.lab.snow`.
     """
 
     slip_horizon: PositiveFloat = 1.0

@@ -36,7 +36,7 @@ class MeasurementOptions:
     load_time_scale: float = 0.1
     """Integral time scale T [s] of loads that shake, 2 T rms^2 / bin the variance of a bin's: a wheel that is lighter
     for a moment slips more in it, so that errors of neighbouring bins add up.  With 0.02 s intervals are too narrow;
-    without any cell 95 % intervals of pressure hold in 96.9 +- 0.4 % (four seeds of `validation.computed_loads`), with
+    without any cell 95 % intervals of pressure hold in 96.9 +- 0.4 % (four seeds of `tests.lab.computed_loads`), with
     0.125 s in 97.4."""
     unknown_slope: float = 0.4
     """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, so that slopes alone take the

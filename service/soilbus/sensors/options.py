@@ -97,7 +97,7 @@ class ConsistencyOptions:
     faults less are found."""
     jump_explained: float = 0.25
     """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
-    fifteen faults of the accelerometer are taken for jumps (`validation.sensitivity`)."""
+    fifteen faults of the accelerometer are taken for jumps (`tests.lab.sensitivity`)."""
 
 
 CONSISTENCY = ConsistencyOptions()

@@ -1,0 +1,87 @@
+"""The watch for immobilisation on simulated drives, with options that may differ from the service's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.arrays import Array
+from soilbus.decision.capability import OverSlip
+from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched, with_loss
+from soilbus.decision.options import WATCH, WatchOptions
+from soilbus.decision.traction_loss import TractionLoss, bins_of_a_moment, motions, slope_felt
+from soilbus.decision.traction_loss import observed as loss_after
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.instrumentation import completed
+from soilbus.estimation.window import forward
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.trials.bogging_trials import Drive, Task, WarningTrial, driven, rated
+from soilbus.trials.windows import bins_of, task_of, torque_limits
+
+
+class Observation(NamedTuple):
+    """One drive as the watch sees it.
+
+    Attributes
+    ----------
+    drive
+        When it is watched, and how it ends.
+    moments
+        What the watch reads at each look.
+    curves
+        Times [s] from which on a curve of pull over slip is known, and the curve.
+    losses
+        What wheels and vehicle do at each look, without any soil; empty where it is not looked at.
+    """
+
+    drive: Drive
+    moments: list[Moment]
+    curves: list[tuple[float, OverSlip]]
+    losses: Sequence[TractionLoss] = ()
+
+
+def observed(task: Task) -> Observation:
+    """Simulate one drive and estimate every hop."""
+    config, (recording, drive) = task.config, driven(task)
+    rig, settings = rig_of(config), config.estimator
+    estimator, limit = WindowEstimator(config), torque_limits(config, rig)
+    store = bins_of(config, recording.channels)
+    curves = []
+    for due in np.arange(settings.window, drive.end, settings.hop).tolist():
+        window = completed(forward(store.window(due - settings.window, due)), rig)
+        result = estimator.solve_unwatched(task_of(window, due, config, limit, fresh=due == settings.window))
+        if result.curve is not None:
+            curves.append((due, result.curve))
+    seen = completed(forward(store.window(0.0, drive.end)), rig)
+    losses, loss, bins, ends = [], TractionLoss(), bins_of_a_moment(settings.bin), np.arange(len(seen.t))
+    for motion in motions(seen, rig, limit, config.traversability, ends, bins):
+        loss = loss_after(loss, motion, config)
+        losses.append(loss)
+    looks = [
+        moment._replace(inertia=moment.inertia - slope_felt(loss, rig))
+        for moment, loss in zip(moments(seen, rig, ends, bins, settings.min_speed), losses, strict=True)
+    ]
+    return Observation(drive, looks, curves, losses)
+
+
+def watch(observation: Observation, options: WatchOptions = WATCH) -> tuple[Array, NDArray[np.bool_]]:
+    """Times [s] (N,) of the looks, and whether each warned."""
+    state, curve, curves, out = Watch(), None, iter(observation.curves), []
+    due = next(curves, None)
+    losses = observation.losses or [TractionLoss()] * len(observation.moments)
+    for moment, loss in zip(observation.moments, losses, strict=True):
+        while due is not None and moment.t >= due[0]:
+            curve, due = due[1], next(curves, None)
+        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia, options)
+        out.append((moment.t, with_loss(state, loss).warning is Alert.IMMOBILISATION))
+    t, warned = np.array(out, float).reshape(-1, 2).T
+    return t, warned > 0.5
+
+
+def judged(kind: str, observation: Observation, options: WatchOptions = WATCH) -> WarningTrial:
+    """The trial's result from what the watch saw."""
+    t, warned = watch(observation, options)
+    return rated(kind, observation.drive, t[1:][warned[1:] & ~warned[:-1]].tolist(), bool(warned[-1]))
