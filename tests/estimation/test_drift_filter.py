@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import expit
+from soilbus.estimation.drift_filter import at_window_end
 
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.solver import Iterate, Objective

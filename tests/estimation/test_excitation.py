@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2
+from soilbus.estimation.laplace import with_nested_laplace
 
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.pipeline.estimator import WindowEstimator

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import norm
-
 from soilbus.estimation.laplace import confidence, density, longer_side
+
 from soilbus.simulator.reference import reference_configuration
 from tests.lab.soil_borders import crossed, drive, first_of_tyres, first_valid, least_sd, wrong, wrong_of_tyres
 

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from soilbus.estimation.laplace import with_nested_laplace
 
 from soilbus.arrays import Array
 from soilbus.config.model import Axle, Config, Signal
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95, SoilPrior

@@ -107,7 +107,7 @@ def with_disengaged(config: Config, rig: Rig, apart: NDArray[np.bool_]) -> Rig:
     wheels = [w.model_copy(update={"driven": w.driven and not off}) for w, off in zip(config.wheel, apart, strict=True)]
     free = rig_of(config.model_copy(update={"wheel": wheels}), rig.options)
     assert free.instrumentation is not None
-    rows = {
+    rows: dict[str, Any] = {
         quantity: tuple(
             row._replace(at=rig.names[quantity].index(row.name)) if row.kind == "channel" else row
             for row in getattr(free.instrumentation, quantity)

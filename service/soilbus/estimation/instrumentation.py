@@ -266,7 +266,7 @@ def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
     given, observations = rig.instrumentation, window.observations
     if other is rig or given is None or observations is None:
         return window
-    W, variance, raw = len(rig.wheels), dict(window.variance), {}
+    W, variance, raw = len(rig.wheels), dict(window.variance), dict[str, Any]()
     columns = {
         "torque": (observations.torque, observations.torque_var),
         "load": (observations.value[:, :W], observations.variance[:, :W]),

@@ -337,7 +337,9 @@ class Measurements:
     @property
     def wheel_torque(self) -> Array:
         """Torques (N, W) [N m] of the wheels by the rows of torques; differentials share equally."""
-        return self.torque if self._torque_matrix is None else np.linalg.solve(self._torque_matrix, self.torque.T).T
+        if self._torque_matrix is None:
+            return self.torque
+        return np.asarray(np.linalg.solve(self._torque_matrix, self.torque.T).T)
 
     @property
     def measured_rows(self) -> NDArray[np.bool_]:

@@ -83,7 +83,7 @@ class SolverOptions:
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Starts of a window's fit, steps of the soil, bounds, and a second mode."""
+    """Starts of a window's fit, steps of the soil, bounds."""
 
     same_end: float = 0.02
     """Relative difference of the objectives [1] below which two descents of the search have met."""
@@ -98,12 +98,6 @@ class SearchOptions:
     max_implausible_evaluations: int = 5
     """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
     `replay-bogging` gets an estimate."""
-    other_optimum_sd: float = 10.0
-    """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
-    are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""
-    min_mode_share: float = 0.05
-    """Share of the probability [1] below which a second mode does not count.  With 0.02 and 0.15 no golden value moves.
-    """
     typical_depth: float = 0.03
     """Sinkage [m] at which the bearing pressure is a coordinate.  With 0.015 and 0.06 no status of the golden replays
     moves."""
@@ -128,37 +122,15 @@ class SearchOptions:
 
 @dataclass(frozen=True, slots=True)
 class PosteriorOptions:
-    """What a fit's posterior is: moments, average along n, drift, path curvature, form, soil classes."""
+    """What a fit's posterior is: moments, form, soil classes."""
 
-    determined_n_sd: float = 0.05
-    """Sd of log n [1] below which a posterior with one mode counts as Gaussian.  With 0.025 ten states of the golden
-    replays move, with 0.1 none."""
-    min_load_signal: float = 4.0
-    """Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1
-    all of it is noise, at 4 a quarter is."""
-    first_node_step: float = 0.1
-    """Longest first step of log n [1] from the mode.  With 0.05 and 0.2 no status of the golden replays moves, and 30
-    values at most."""
-    node_step_growth: float = 1.7
-    """Ratio [1] of each step of log n to the one before: 10 nodes in place of 12 with 1.4, the same errors and coverage
-    at constant loads (`posterior_forms --seed 178`); longer first steps are not as good there."""
-    negligible: float = 9.0
-    """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
-    gaussian_widening: float = 1.2
-    """How much wider [1] than the mode's Gaussian the average along n may be for a posterior to count as one: without
-    this limit the windows of a rear-driven tractor, all averaged, make intervals that hold in 54 to 100 % on three
-    minutes of loam and clay, with it in 66 to 100 %."""
     max_log_variance: float = 4.0
     """Variance of a parameter's logarithm [1] from which it is open, in what is reported: one that may be anywhere
     within `bound_sd` prior sd (of 0.83, std = value) is uniform, with 4^2 0.83^2 / 3 = 3.7.  At its bound a parameter
     that is linear in the fit may have any variance of its logarithm: without this k_phi had an std of 1e155 on snow."""
-    drift_pieces: int = 5
-    """Pieces of a window, each with its own soil.  With 3 and 8 three and six states of the golden replays move."""
-    steady_drift_sd: float = 7.0
-    """Prior sd of a steady change of the soil in one window, in units of `drift` [1].  With 3 and 20 no status of the
-    golden replays moves."""
-    knot_spacing: float = 1.0
-    """Time [s] between two knots of the path's curvature.  With 0.5 and 2 s no status of the golden replays moves."""
+    form_discount: float = 3.0
+    """Residuals [1] that say as much of the contact's form as one would say without errors of the model that all share.
+    With 1 tan phi of `d-base-0` is 12 % off with an sd of 4 %, with 6 pressures on the foreign drives are 18 % off."""
     form_stride: int = 4
     """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
     mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in

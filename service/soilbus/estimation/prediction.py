@@ -47,4 +47,6 @@ def prediction_shares(problem: ObservationModel, at: Linearisation, since: float
     counts = np.maximum(counts, 1.0)
     squares = (errors / counts) ** 2, (sizes / counts) ** 2
     parts = {"torque": slice(W), "draft": slice(W, W + 1)}
-    return {name: Share(*(float(s[:, part].sum()) for s in squares)) for name, part in parts.items() if known[:, part].any()}
+    return {
+        name: Share(*(float(s[:, part].sum()) for s in squares)) for name, part in parts.items() if known[:, part].any()
+    }

@@ -46,14 +46,14 @@ from soilbus.estimation.observation_model import (
 )
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
-from soilbus.estimation.prediction import Share, prediction_shares
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.prediction import Share, prediction_shares
 from soilbus.estimation.solver import Objective
-from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.estimation.variance_components import VarianceComponents, correction_ratios
+from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.terra.wheel import WheelModel
 
 __all__ = [
     "ChangePoint",
@@ -605,12 +605,7 @@ class Tracker:
         gains = problem.gain_std**2 * min(elapsed / self.options.gain_memory, 1.0)
         if self._state.transition is not None and end <= self._state.transition.end:
             return gaussian.with_prior_soil(self.soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        form = (
-            None
-            if gaussian.form is None
-            else gaussian.form.drifted(self.settings.form, elapsed / self.options.gain_memory)
-        )
-        return replace(gaussian.drifted(self._drift(gaussian, elapsed), gains), form=form)
+        return gaussian.drifted(self._drift(gaussian, elapsed), gains)
 
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
         """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
@@ -650,10 +645,11 @@ class Tracker:
         """Part of a fit that the form of the model leaves open; None where the form is held."""
         if not any(self.settings.form):
             return None
-        joint_prior = objective.joint_prior.form or FormPosterior.of(self.settings.form, len(fit.gains))
+        prior = FormPosterior.of(self.settings.form, len(fit.gains))
+        if objective.joint_prior.form is not None:
+            prior = replace(prior, by_form=objective.joint_prior.form.by_form)
         with np.errstate(all="ignore"):
-            pr = FormPosterior.of(self.settings.form, len(fit.gains))
-            return form_posterior(objective, fit, replace(joint_prior, mean=pr.mean, covariance=pr.covariance))
+            return form_posterior(objective, fit, prior)
 
     def _store(self, tracked: TrackerOutput, state: SoilState, end: float, problem: ObservationModel) -> None:
         """Store the result for later windows; a mismatch does not become a prior."""
@@ -787,4 +783,3 @@ def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list
     """Names and prior sd (G,) of a vehicle's nuisance parameters: sensor gains, then effect parameters."""
     problem = ObservationModelWithEffects(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
     return problem.gain_names, problem.gain_std
-

@@ -51,7 +51,7 @@ from soilbus.estimation.instrumentation import recompleted
 from soilbus.estimation.measurements import MASS_GAIN, gains_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
-from soilbus.estimation.posterior import NORMAL_95, Estimate, Posterior
+from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window, steady
@@ -228,7 +228,10 @@ class WindowEstimator:
         demand = present_demand(window, rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
         corrections = Corrections(self._torque_ceiling(task, window), effects)
-        result, limit = replace(result, corrections=corrections), corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig))
+        result, limit = (
+            replace(result, corrections=corrections),
+            corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig)),
+        )
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
@@ -424,6 +427,7 @@ class WindowEstimator:
         if not tracked.mismatch or (fit is not None and fit.converged):
             return None
         return "no_convergence" if fit is not None or tracked.search_ended else "not_finite"
+
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:
     """Which soil a window is of, and why."""
