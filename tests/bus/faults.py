@@ -23,7 +23,7 @@ from soilbus.can.bus import ask_for_buffer
 CHANNEL = "vcan7"
 SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli.main import main; sys.exit(main())"]
 STAMP = struct.Struct("@ll")
-FRAME = struct.Struct("=IB3x8s")
+FRAME, FD_FRAME = struct.Struct("=IB3x8s"), struct.Struct("=IBB2x64s")
 EXTENDED, ERROR = 1 << 31, 1 << 29
 BEYOND = 150  # frames more than a receive buffer holds
 BABBLE = 2.0
@@ -180,6 +180,10 @@ def steps(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
     bus.mark("foreign")
     bus.send(EXTENDED | 0x18FF649A, bytes.fromhex("3328FF0404075F5D"))  # dbc/README.md's example: go
     bus.until("foreign_sender")
+    with mouth() as own:
+        own.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        own.send(FD_FRAME.pack(EXTENDED | 0x18FF649A, 8, 0, bytes(8)))
+    bus.until("2 frames of another sender")
     time.sleep(0.5)
     bus.mark("end")
 

@@ -219,6 +219,52 @@ def test_frames_that_a_counter_skips_are_counted_across_batches_and_its_turn() -
     assert admission(LEFT).missed is None  # nothing counts there: not 0
 
 
+def reasons_of(frames: Iterable[tuple[int, int]], split: int | None = None) -> list[str]:
+    """Of frames by counter and value, 0.1 s apart, why each is refused ("": it is not); split: taken in two batches."""
+    frames = list(frames)
+    a = admission(("Guarded", "Value"), checked=["Guarded"])
+    said = [""] * len(frames)
+    for i, (counter, value) in enumerate(frames):
+        a.feed(0.1 * i, 257, False, guarded(value, counter % 16))
+        if i + 1 in (split, len(frames)):
+            for (_, reason), t in a.take().refused.items():
+                for when in t.tolist():
+                    said[round(10 * when)] = str(reason)
+    return said
+
+
+def test_five_net_errors_of_the_counter_are_a_second_sender_until_five_are_made_good() -> None:
+    good, jumps = [(i, 5) for i in range(10)], [(9 + 3 * i, 5) for i in range(1, 9)]
+    after = [(jumps[-1][0] + i, 5) for i in range(1, 8)]
+    assert reasons_of(good + jumps + after) == [""] * 14 + ["second_sender"] * 8 + [""] * 3
+
+
+def test_one_loss_in_four_frames_is_no_second_sender() -> None:
+    assert set(reasons_of((i + i // 4, 5) for i in range(100))) == {""}
+
+
+def test_the_same_counter_with_another_payload_is_a_second_sender_at_once() -> None:
+    frames = [(0, 5), (1, 5), (1, 5), (2, 5), (3, 5), (3, 6), (4, 5), (5, 5), (6, 5), (7, 5), (8, 5), (9, 5)]
+    assert reasons_of(frames) == ["", "", "bad_counter", "", "", "bad_counter", *["second_sender"] * 4, "", ""]
+
+
+@settings(derandomize=True, max_examples=100, deadline=None)
+@given(st.integers(1, 3), st.integers(2, 14), st.integers(1, 60))
+def test_whoever_mixes_into_a_message_with_a_counter_of_its_own_is_found_in_any_batches(rate, ahead, split) -> None:
+    """Up to twice as many frames as the true sender's; counters run on for both."""
+    foreign = 0
+    frames: list[tuple[int, int]] = []
+    for i in range(60):
+        frames.append((i, 5))
+        for _ in range(min(rate, 2) if i >= 20 else 0):
+            foreign += 1
+            frames.append((i + ahead + foreign, 900))
+    said = reasons_of(frames)
+    assert said == reasons_of(frames, split)
+    assert set(said[:20]) == {""}
+    assert "second_sender" in said[20:50]
+
+
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.integers(0, 31))
 def test_any_flipped_bit_of_a_guarded_frame_is_refused(bit: int) -> None:

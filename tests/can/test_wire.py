@@ -88,6 +88,7 @@ def test_frames_are_read_as_python_can_builds_them(message, t):
     frame = wire(Kernel((build_can_frame(message), [stamp(t)], 0))).recv(0.0)
     assert (frame.arbitration_id, frame.is_extended_id) == (message.arbitration_id, message.is_extended_id)
     assert (frame.is_remote_frame, frame.is_error_frame) == (message.is_remote_frame, False)
+    assert frame.is_fd == message.is_fd
     assert frame.data == bytes(message.data)
     assert frame.timestamp == pytest.approx(t, abs=1e-6)
 
@@ -116,6 +117,7 @@ def test_overruns_are_what_the_kernel_counts_on_top_also_past_its_end():
     kernel = Kernel(*((raw, [stamp()] + ([] if n is None else [overflow(n)]), 0) for n in counts))
     ear = wire(kernel)
     assert (socket.SOL_SOCKET, OVERFLOWS, 1) in kernel.options
+    assert (socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1) in kernel.options  # else the kernel hides them
     seen = []
     for _ in counts:
         ear.recv(0.0)

@@ -146,7 +146,8 @@ def c_program(name, database, readme):
     for message in database.messages:
         m = f"{name}_{camel_to_snake_case(message.name)}"
         prints = "".join(
-            f'printf(" %.17g", {m}_{s}_decode(v.{s}));' for s in (camel_to_snake_case(x.name) for x in message.signals)
+            f'printf(" %.17g %d", {m}_{s}_decode(v.{s}), {m}_{s}_is_in_range(v.{s}));'
+            for s in (camel_to_snake_case(x.name) for x in message.signals)
         )
         unpack = f"struct {m}_t v; if ({m}_unpack(&v, data, 8)) return 1;"
         cases.append(f"case 0x{message.frame_id:x}u: {{ {unpack} {prints} break; }}")
@@ -186,10 +187,15 @@ def test_generated_c_code_compiles_and_decodes_as_cantools(name, tmp_path):
     lines = "".join(f"{message.frame_id:x} {data.hex(' ')}\n" for message, data in cases)
     output = subprocess.run([tmp_path / "decode"], input=lines, text=True, capture_output=True, check=True).stdout
     for (message, data), line in zip(cases, output.splitlines(), strict=True):
-        crc, *values = line.split()
+        crc, *said = line.split()
+        values, in_range = said[::2], said[1::2]
         assert int(crc) == frame_checksum(message.frame_id, data, 7)
         expected = message.decode(data, decode_choices=False)
-        for signal, value in zip(message.signals, values, strict=True):
+        raw = message.decode(data, decode_choices=False, scaling=False)
+        for signal, value, is_value in zip(message.signals, values, in_range, strict=True):
+            ends = (round((end - signal.offset) / signal.scale) for end in (signal.minimum, signal.maximum))
+            low, high = sorted(ends)
+            assert (is_value == "1") == (low <= raw[signal.name] <= high), signal.name
             assert float(value) == pytest.approx(expected[signal.name], rel=1e-12, abs=1e-12), signal.name
 
 
@@ -198,6 +204,8 @@ def test_every_reason_of_a_refusal_has_its_code():
 
     of_window = load("soilbus").get_message_by_name("WindowQuality").get_signal_by_name("RejectedReason")
     names = [str(of_window.choices[code]) for code in range(int(of_window.maximum) + 1)]
-    of_reason = {Reason.NOT_AVAILABLE: "no_value", Reason.ERROR: "sensor_error"}
-    assert names == ["none", *(of_reason.get(reason, str(reason)) for reason in Reason), "outlier"]
+    of_reason = {
+        Reason.NOT_AVAILABLE: "no_value", Reason.ERROR: "sensor_error", Reason.SECOND_SENDER: "bad_counter"
+    }  # fmt: skip
+    assert names == ["none", *dict.fromkeys(of_reason.get(reason, str(reason)) for reason in Reason), "outlier"]
     assert set(of_window.choices) == {*range(len(names)), 254, 255}

@@ -41,7 +41,11 @@ class Desk:
         self.dashboard = Dashboard(self.known, vehicle or Vehicle.of(CONFIG))
 
     def send(self, name: str, **values) -> None:
-        self.known.receive(message(self.publisher.frame(name, values)))
+        """A frame; of a verdict as many in a row as a reader asks for, the last of them now."""
+        now = self.clock.now
+        for before in range(5, -1, -1) if name == "Traversability" else (0,):
+            self.clock.now = now - 0.1 * before
+            self.known.receive(message(self.publisher.frame(name, values)))
         self.dashboard.sample()
 
     def send_all(self, **changed) -> None:
@@ -320,6 +324,32 @@ def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
     assert dashboard.value("Traversability", "State") is None
 
 
+def test_a_frame_of_can_fd_is_never_ours(setup):
+    publisher, dashboard, _ = setup
+    frame = message(publisher.frame("Traversability", {"State": "no_go"}))
+    frame.is_fd = True
+    dashboard.receive(frame)
+    assert (dashboard.bad_frames, dashboard.value("Traversability", "State")) == (1, None)
+
+
+def test_a_second_sender_is_named_and_nothing_of_its_message_is_shown(desk):
+    desk.send_all(DemandForecast={"Warning": "none"})
+    assert desk.dashboard.verdict().word == "GO"
+    desk.send("WheelSlip", SlipWheel1=0.1)
+    twin = Publisher(output_database(CONFIG))
+    for _ in range(2):
+        frame = twin.frame("WheelSlip", {"SlipWheel1": 0.3})
+    desk.known.receive(message(frame))
+    assert desk.dashboard.verdict()[:3] == (
+        "UNKNOWN", "UNKNOWN: another node sends our frames", "Remove the second soilbus"
+    )  # fmt: skip
+    assert desk.known.value("WheelSlip", "SlipWheel1") is None
+    assert not desk.known.is_valid("TractionLimits")
+    desk.clock.now += 3.0
+    desk.send_all(DemandForecast={"Warning": "none"})
+    assert desk.dashboard.verdict().word == "GO"
+
+
 def test_a_stuck_counter_keeps_nothing_fresh(setup):
     publisher, dashboard, clock = setup
     stuck, after = (message(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
@@ -329,6 +359,10 @@ def test_a_stuck_counter_keeps_nothing_fresh(setup):
     assert dashboard.bad_frames == 9
     assert dashboard.value("Traversability", "State") is None
     dashboard.receive(after)
+    assert dashboard.value("Traversability", "State") == "unknown"
+    for _ in range(5):
+        clock.now += 0.1
+        dashboard.receive(message(publisher.frame("Traversability", {"State": "go"})))
     assert dashboard.value("Traversability", "State") == "go"
 
 
@@ -426,14 +460,14 @@ def test_frames_that_were_moved_to_identifiers_of_11_bits_are_read_under_these_a
     (tmp_path / "moved.dbc").write_text(re.sub(r".*VFrameFormat.*\n", "", text))
     database = output_database(reference_configuration([f'output.dbc="{tmp_path / "moved.dbc"}"']))
     known, publisher = ReceivedFrames(database, FakeClock()), Publisher(database)
-    frame = message(publisher.frame("Traversability", {"State": "go"}))
+    frame = message(publisher.frame("Traversability", {"State": "no_go"}))
     assert not frame.is_extended_id
     frame.is_extended_id = True
     known.receive(frame)
     assert known.value("Traversability", "State") is None
     frame.is_extended_id = False
     known.receive(frame)
-    assert known.value("Traversability", "State") == "go"
+    assert known.value("Traversability", "State") == "no_go"
 
 
 def test_the_slip_bar_is_of_the_wheel_that_slips_most_and_the_best_slip_of_its_axle(desk):

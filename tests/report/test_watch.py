@@ -35,9 +35,9 @@ DATABASE = output_database(reference_configuration())
 BEGIN = 1.7e9
 
 
-def sent(seconds: float, state="go") -> list[can.Message]:
-    """Frames of some seconds of a service that says the same all the time."""
-    publisher, found = Publisher(DATABASE), []
+def sent(seconds: float, state="go", publisher: Publisher | None = None) -> list[can.Message]:
+    """Frames of some seconds of a service that says the same all the time, or goes on from what it sent before."""
+    publisher, found = publisher or Publisher(DATABASE), []
     for i in range(round(10 * seconds)):
         values = {
             "Traversability": {"State": state, "Probability": 0.99, "Age": 0.5, "SinceValid": 0.5, "Window": 1},
@@ -115,20 +115,22 @@ def test_the_end_of_a_recording_ends_it_and_its_silences_are_silences():
     source = PlayedLog(sent(5.0) + late, 1.0, clock, clock.sleep)
     said = lines_of(source, clock, lambda: source.is_over, source.now)
     assert clock.now - 1000.0 == pytest.approx(21.9, abs=0.3)
-    assert [text[:3] for t, text in said if t < 5.0] == ["GO,"] * sum(t < 5.0 for t, _ in said)
+    assert said[0][1].startswith("UNKNOWN: waiting for 5 frames in a row")
+    assert [text[:3] for t, text in said[1:] if t < 5.0] == ["GO,"] * 5
     assert re.match("UNKNOWN: soilbus is gone, for 7 s", next(text for t, text in said if t > 11.9))
     assert said[-1][1].startswith("GO, p = 0.99. Keep going. Slip ")
 
 
 def test_lines_come_once_a_second_and_at_once_when_the_state_changes():
-    clock = FakeClock()
-    worse = sent(3.0, "no_go")
+    clock, publisher = FakeClock(), Publisher(DATABASE)
+    good, worse = sent(3.5, "go", publisher), sent(3.0, "no_go", publisher)
     for message in worse:
         message.timestamp += 3.5
-    wire = ScriptedBus(clock, sent(3.5) + worse, BEGIN)
+    wire = ScriptedBus(clock, good + worse, BEGIN)
     bus = LiveBus(lambda: wire, clock, clock.sleep)
     bus.open()
     said = lines_of(bus, clock, lambda: clock.now > 1006.4)
+    said = said[1:]  # the first one waits for frames in a row
     times = [t for t, _ in said]
     turned = next(t for t, text in said if text.startswith("NO-GO"))
     assert turned == pytest.approx(3.5, abs=0.25)

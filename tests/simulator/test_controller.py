@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from soilbus.can.candump import Frame, frame_of
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
 from soilbus.offline.sent_frames import sent_beside
 from soilbus.simulator.commands import Commands
 from soilbus.simulator.drive import Command, Drive, drive, joined
@@ -26,6 +28,7 @@ ONTO_CLAY = Scenario(
     25.0, (Patch(0.0, "loam"), Patch(18.0, "wet_clay")), Swing(1.4, 1.4), draft=Swing(300.0, 300.0), lift_slip=None
 )
 
+OURS, TRACTOR = output_database(CONFIG), load_databases(CONFIG)
 CUT = can.Message(arbitration_id=0x18FF719A, data=b"\x01\x02")
 """Set-points of a broken sender: no reader may fall over them."""
 
@@ -56,15 +59,52 @@ class ClosedLoop:
             yield from map(frame_of, frames)
 
 
-@pytest.fixture(scope="module")
-def followed() -> Drive:
+def follow(bus) -> None:
+    """The example drives the tractor on that bus."""
     spec = importlib.util.spec_from_file_location("controller", EXAMPLE)
     controller = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(controller)
-    bus = ClosedLoop()
     controller.follow(bus)
+
+
+@pytest.fixture(scope="module")
+def followed() -> Drive:
+    bus = ClosedLoop()
+    follow(bus)
     assert bus.lost_commands == 0
     return joined(bus.steps)
+
+
+ADVICE = {"SlipForEfficiencyRear": 0.2, "Status": "valid"}
+
+
+class Spoofed:
+    """A bus on which soilbus says go and gives set-points, and a stranger's set-points from 6 s on; no physics."""
+
+    def __init__(self, stranger: bool) -> None:
+        self._stranger, self.drafts = stranger, list[float]()
+
+    def __iter__(self) -> Iterator[can.Message]:
+        ours, theirs = Publisher(OURS), Publisher(OURS)
+        for i in range(120):
+            heard = self._stranger and i >= 60
+            values = {
+                "Traversability": {"State": "unknown" if heard else "go"},
+                "WheelSlip": {"SlipWheel3": 0.2, "SlipWheel4": 0.2},
+            }
+            values |= {"TractionAdvice": ADVICE} if i % 10 == 0 else {}
+            for name, of_frame in values.items():
+                yield self._message(ours.frame(name, of_frame), 0.1 * i)
+            false = theirs.frame("TractionAdvice", ADVICE | {"SlipForEfficiencyRear": 0.9})
+            if heard:
+                yield self._message(false, 0.1 * i + 0.01)
+
+    @staticmethod
+    def _message(frame, t: float) -> can.Message:
+        return can.Message(timestamp=t, arbitration_id=frame.arbitration_id, data=frame.data)
+
+    def send(self, message: can.Message) -> None:
+        self.drafts.append(TRACTOR.decode_message(message.arbitration_id, message.data)["Draft"])
 
 
 def mean_draft(done: Drive, soil: str | None = None) -> float:
@@ -90,6 +130,14 @@ def test_it_pulls_more_than_at_the_constant_slip_that_it_holds_without_advice(fo
     constant = drive(CONFIG, replace(ONTO_CLAY, draft=None, slip=Swing(0.15, 0.15)), SEED)
     for soil in (None, "loam", "wet_clay"):
         assert mean_draft(followed, soil) > mean_draft(constant, soil) + 300.0
+
+
+def test_a_strangers_set_points_are_not_followed():
+    alone, spoofed = Spoofed(stranger=False), Spoofed(stranger=True)
+    follow(alone)
+    follow(spoofed)
+    assert min(alone.drafts[15:60]) == pytest.approx(alone.drafts[15], rel=1e-3)  # advice and slip agree
+    assert max(spoofed.drafts[60:]) <= spoofed.drafts[59] + 1.0
 
 
 @pytest.mark.parametrize("slip", [0.10, 0.20, 0.26])

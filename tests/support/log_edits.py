@@ -308,6 +308,23 @@ def broken_checksums(message: str) -> Edit:
     return lambda log, t: log.changed(message, lambda s: edit(s, t))
 
 
+def joined_by(message: str, extra: int) -> Edit:
+    """A second sender adds frames to each one: a byte differs, counters jump, the Checksum is right."""
+
+    def edit(s: Stream, t: float) -> Stream:
+        origin = np.repeat(np.flatnonzero(s.t >= t), extra)
+        payload = s.payload[origin]
+        payload[:, 0] ^= 0x10
+        other = Stream(s.message, s.t[origin] + 0.001 * (1 + np.arange(len(origin)) % extra), payload)
+        counters = np.random.default_rng(7).integers(16, size=len(origin))
+        other = other.with_codes("Counter", counters, np.ones(len(origin), np.bool_))
+        stamps = np.concatenate([s.t, other.t])
+        order = np.argsort(stamps)
+        return Stream(s.message, stamps[order], np.concatenate([s.payload, other.payload])[order])
+
+    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+
+
 def clock_set(by: float) -> Edit:
     """All stamps jump."""
     return every_frame(lambda s, t: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))

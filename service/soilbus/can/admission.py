@@ -28,6 +28,7 @@ from soilbus.can.inbox import (
     counter_moved,
     inbox_of,
     not_twice,
+    of_one_sender,
     popped,
     time_forward,
 )
@@ -260,6 +261,7 @@ class Admission:
             (checksum_right, Reason.BAD_CHECKSUM),
             (time_forward, Reason.TIME_BACKWARDS),
             (counter_moved, Reason.BAD_COUNTER),
+            (of_one_sender, Reason.SECOND_SENDER),
             (not_twice, Reason.DUPLICATE),
         ):
             batch = self._passed(inbox, batch, check, reason, out)

@@ -17,6 +17,7 @@ class Reason(StrEnum):
     WRONG_SOURCE = "wrong_source"
     BAD_CHECKSUM = "bad_checksum"
     BAD_COUNTER = "bad_counter"
+    SECOND_SENDER = "second_sender"
     DUPLICATE = "duplicate"
     REMOTE_FRAME = "remote_frame"
     TIME_BACKWARDS = "time_backwards"

@@ -24,6 +24,9 @@ from soilbus.can.validity import CodeRule, rule_of
 TWICE = 0.002
 """Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
 
+COUNTER_ERRORS = 5
+"""Net errors of a counter [frames] from which its message is not trusted (opendbc, `MAX_BAD_COUNTER`)."""
+
 _NO_FRAME = (-math.inf, -1, b"")
 
 Data = bytes | bytearray
@@ -67,6 +70,13 @@ class Inbox:
     last_t: float = -math.inf
     last_id: int = -1
     last_counter: int = -1
+    last_data: bytes = b""
+    counter_errors: int = 0
+    """Frames whose counter did not go on by one, less those whose counter did; from 0 to COUNTER_ERRORS."""
+    is_untrusted: bool = False
+    """Whether the errors have reached COUNTER_ERRORS and are not back at 0 yet."""
+    untrusted: Mask | None = None
+    """Which frames of the last batch came while the message was not trusted."""
     last_frame: tuple[float, int, bytes] = _NO_FRAME
     missed: int = 0
     """Frames that the counters of a checked message skip: lost, or refused for their checksum."""
@@ -76,6 +86,7 @@ class Inbox:
         self.frames.clear()
         self.late.clear()
         self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
+        self.last_data, self.counter_errors, self.is_untrusted = b"", 0, False
         if self.lock is not None:
             self.lock.release()
 
@@ -137,8 +148,9 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
     """False where a frame repeats the counter of the one before it from the same sender; None where none does.
 
-    What the counters skip is counted in `inbox.missed`.
+    What the counters skip is counted in `inbox.missed`; what cannot be trusted is kept for `of_one_sender`.
     """
+    inbox.untrusted = None
     if inbox.checksum_byte is None:
         return None
     column = inbox.decoder.columns_of(batch.blocks(inbox.decoder))[COUNTER]
@@ -146,10 +158,39 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
     modulus = 1 << inbox.message.get_signal_by_name(COUNTER).length
     step = np.diff(counter, prepend=inbox.last_counter) % modulus
     follows = np.diff(batch.ids, prepend=inbox.last_id) == 0
-    inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
-    inbox.missed += int(np.maximum(step - 1, 0)[follows].sum())
     moved: Mask = (step != 0) | ~follows
+    untrusted = _untrusted(inbox, batch, step, follows)
+    inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
+    inbox.last_data = batch.payload[-1].tobytes()
+    inbox.missed += int(np.maximum(step - 1, 0)[follows if untrusted is None else follows & ~untrusted].sum())
+    if untrusted is not None:
+        inbox.untrusted = untrusted[moved]
     return None if moved.all() else moved
+
+
+def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mask) -> Mask | None:
+    """True from the frame whose error is the last of COUNTER_ERRORS until no error is left; None without any error.
+
+    A counter that does not go on by one is an error; one that does takes an error back.  The same counter with another
+    payload is COUNTER_ERRORS at once: only a second sender, or a broken one, sends it.
+    """
+    wrong = follows & (step != 1)
+    if not inbox.counter_errors and not wrong.any():
+        return None
+    before = [inbox.last_data, *(row.tobytes() for row in batch.payload)]
+    untrusted = np.zeros(len(step), dtype=np.bool_)
+    for i in np.flatnonzero(follows).tolist():
+        is_twin = step[i] == 0 and before[i] != before[i + 1]
+        change = -1 if not wrong[i] else COUNTER_ERRORS if is_twin else 1
+        inbox.counter_errors = min(max(inbox.counter_errors + change, 0), COUNTER_ERRORS)
+        inbox.is_untrusted = inbox.counter_errors == COUNTER_ERRORS or (inbox.is_untrusted and inbox.counter_errors > 0)
+        untrusted[i] = inbox.is_untrusted
+    return untrusted
+
+
+def of_one_sender(inbox: Inbox, batch: Batch) -> Mask | None:
+    """False where `counter_moved` found that the counters cannot be trusted; None where they can throughout."""
+    return None if inbox.untrusted is None else ~inbox.untrusted
 
 
 def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:

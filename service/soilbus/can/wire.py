@@ -12,6 +12,7 @@ import select
 import socket
 import struct
 import time
+from contextlib import suppress
 from typing import NamedTuple, Protocol
 
 import can
@@ -34,7 +35,7 @@ _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29  # flags of can_id
 _IDENTIFIER = (1 << 29) - 1
 _HEAD = struct.Struct("=IB3x")  # can_id, length; the same in struct can_frame and canfd_frame
 _FRAME = struct.Struct("=IB3x8s")
-_LONGEST = 72
+_LONGEST = 72  # of struct canfd_frame
 _STAMP = struct.Struct("@ll")
 _COUNT = struct.Struct("@I")
 _ANCILLARY = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(_COUNT.size)
@@ -50,6 +51,7 @@ class Received(NamedTuple):
     is_error_frame: bool
     data: bytes
     is_rx: bool = True
+    is_fd: bool = False
 
 
 class MessageBus(Protocol):
@@ -112,6 +114,8 @@ class SocketWire:
         own.setblocking(False)
         own.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALL_SEND_BUFFER)
+        with suppress(OSError):  # where the socket knows no CAN FD, none comes; else one under our id would be hidden
+            own.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         self._poll = select.poll()
         self._poll.register(own, select.POLLIN)
 
@@ -143,7 +147,8 @@ class SocketWire:
             return None
         word, length = _HEAD.unpack_from(raw)
         return Received(
-            t, word & _IDENTIFIER, word & _EXTENDED != 0, word & _REMOTE != 0, word & _ERROR != 0, raw[8 : 8 + length]
+            t, word & _IDENTIFIER, word & _EXTENDED != 0, word & _REMOTE != 0, word & _ERROR != 0,
+            raw[8 : 8 + length], is_fd=len(raw) == _LONGEST,
         )  # fmt: skip
 
     def stamping_time(self) -> float:

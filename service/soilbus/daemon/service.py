@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from soilbus import __version__
 from soilbus.can.bus import SAY_AGAIN, LiveBus
 from soilbus.can.bus_state import BusState
+from soilbus.can.doubts import RecentDoubts
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
 from soilbus.daemon.bus_health import health_frame, health_text
@@ -38,7 +39,7 @@ from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.pipeline.corrections import NO_CORRECTIONS
-from soilbus.pipeline.intake import Latest
+from soilbus.pipeline.intake import Latest, input_rejected
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult, as_of
@@ -67,7 +68,7 @@ holds 75 ms of a full bus."""
 MAX_CURVE_AGE = 60.0
 """Age [s] up to which a valid window's pull over slip is used to watch for immobilisation."""
 FOREIGN_SENDER_HOLD_TIME = 3.0
-"""Time [s] for which another sender under our identifiers is reported, so that every reader sees it."""
+"""Time [s] for which a second sender of our frames or of an input is reported, so that every reader sees it."""
 
 
 class Service:
@@ -154,6 +155,7 @@ class Service:
         self._health, self._fault = Health(self._started), ""
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
         self._failing = "none"
+        self._doubts = RecentDoubts(self.intake.admission.counts)
         self._said: dict[str, float] = {}
 
     def _first_estimator(self) -> WindowEstimator:
@@ -361,6 +363,8 @@ class Service:
         read = self._time.read_until(now)
         if stale := self.intake.stale(read, self._inputs_since):
             return ServiceState.DEGRADED, self._why_stale(stale, read)
+        if untrusted := self.intake.untrusted(read - FOREIGN_SENDER_HOLD_TIME):
+            return ServiceState.DEGRADED, input_rejected(untrusted)
         if self._fault or self._guarded_estimator.in_fault:
             return ServiceState.FAULT, self._fault or INTERNAL
         if now - self.bus.last_foreign < FOREIGN_SENDER_HOLD_TIME:
@@ -411,7 +415,7 @@ class Service:
             return "input_missing " + " ".join(never)
         if silent:
             return "input_stale " + " ".join(silent)
-        return "input_rejected " + " ".join(f"{name} ({refused[name]})" for name in stale)
+        return input_rejected({name: refused[name] for name in stale})
 
     @property
     def _last(self) -> WindowResult | None:
@@ -545,6 +549,11 @@ class Service:
             text += f", deadline misses {self.deadline_misses}"
         if self.failures:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
+        for doubted, line in self._doubts.at(now).items():
+            text += f", {line}"
+            if now - self._said.get(doubted, -math.inf) >= SAY_AGAIN:
+                self._said[doubted] = now
+                log.warning("%s", line)
         if health := health_text(self.bus.state, self.bus.counts):
             text += f", bus: {health}"
         for beside in (self._claim, self._outlet):

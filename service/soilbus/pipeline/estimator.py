@@ -57,7 +57,7 @@ from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput,
 from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.determination import excitation_of, lacking, sinkage_range
-from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.intake import WindowTask, input_rejected
 from soilbus.pipeline.model_gap import GapWatch, PredictionWatch, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active
@@ -381,9 +381,11 @@ class WindowEstimator:
         return Basis(instants, self._settings.bin, unseen, task.late)
 
     def _status(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
-        """Status and reason; an implausible sensor replaces the reasons that it may have caused."""
+        """Status and reason; a second sender or an implausible sensor replaces the reasons that it may have caused."""
         status, reason = self._status_without_plausibility(task, tracked)
         follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
+        if task.untrusted and not task.missing:
+            return status if status is Status.INVALID else Status.DEGRADED, input_rejected(task.untrusted)
         return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
 
     def _status_without_plausibility(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:

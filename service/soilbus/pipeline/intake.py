@@ -22,6 +22,7 @@ from cantools.database.can import Database
 from soilbus.arrays import Array
 from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.channels import Channel, Decoded
+from soilbus.can.channels import Reason as Refusal
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
@@ -64,9 +65,9 @@ class WindowTask:
         [s].
     window, slip
         The forward data, and mean slip by wheel (None where not known).
-    missing, poor, implausible
+    missing, poor, implausible, untrusted
         Needed channels never received; needed channels that are stale at the end or cover the window badly; channels
-        that contradict the others and were removed from the window.
+        that contradict the others and were removed from the window; channels of a message with a second sender.
     torque_limit
         (W,) [N m], nan where not known.
     track
@@ -91,6 +92,7 @@ class WindowTask:
     track: PositionTrack = field(default_factory=lambda: PositionTrack({}))
     rejected: dict[str, int] = field(default_factory=dict)
     implausible: tuple[str, ...] = ()
+    untrusted: Mapping[str, str] = field(default_factory=dict)
     late: float = 0.0
     epoch: int = 0
 
@@ -239,9 +241,8 @@ class Intake:
         self._binned = frozenset(self.rig.channels)
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
-        self._positions = PositionTrack(
-            {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}, options.fix_smoothing
-        )
+        self._of_position = {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}
+        self._positions = PositionTrack(self._of_position, options.fix_smoothing)
         self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
         of_effects = delays_of(config) if delays is None else delays
         late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
@@ -289,6 +290,7 @@ class Intake:
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
         self._last_refused: dict[str, tuple[float, str]] = {}
+        self._last_untrusted: dict[str, float] = {}
         self._newest = -math.inf  # stamp of the latest sample, admitted or refused
 
     def _screen_the_rest(self) -> None:
@@ -314,6 +316,8 @@ class Intake:
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
         for (name, reason), t in decoded.refused.items():
             self._last_refused[name] = max(self._last_refused.get(name, (-math.inf, "")), (float(t[-1]), str(reason)))
+            if reason is Refusal.SECOND_SENDER and name not in self._of_position:
+                self._last_untrusted[name] = float(t[-1])
         for name, (t, value) in heard.items():
             if name.startswith("torque_limit."):
                 self._limits.add(name.removeprefix("torque_limit."), t, value)
@@ -388,6 +392,7 @@ class Intake:
             fresh=self._fresh,
             late=self._latest,
             implausible=self._implausible,
+            untrusted=self.untrusted(start),
             epoch=self.epoch,
         )
         self._fresh = False
@@ -408,6 +413,10 @@ class Intake:
             for c in self.needed
             if not now - self.last_seen.get(c.name, since) <= self._timeout(c)  # nor nan
         ]
+
+    def untrusted(self, since: float) -> dict[str, str]:
+        """Channels, other than positions, with a sample refused for a second sender since `since` [s], and why."""
+        return {name: str(Refusal.SECOND_SENDER) for name, t in self._last_untrusted.items() if t >= since}
 
     def refused(self, now: float) -> dict[str, str]:
         """Needed channels with a refused sample within their time-out before `now` [s], and why it was refused."""
@@ -446,6 +455,11 @@ class Intake:
         if self.rig.instrumentation is not None:
             slip[:, self.rig.instrumentation.without_speed] = np.nan  # their speed is assumed
         return dict(zip(self.rig.wheels, column_means(slip), strict=True))
+
+
+def input_rejected(refused: Mapping[str, str]) -> str:
+    """Return the reason of a status for refused channels, each with why it is refused."""
+    return " ".join(["input_rejected", *(f"{name} ({why})" for name, why in refused.items())])
 
 
 def _times(decoded: Decoded) -> tuple[float, float] | None:

@@ -68,8 +68,8 @@ PARAMETER_FRAMES = {
     "K": ("SoilShearModulus", 1e-3),
 }
 
-REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error"}
-"""Reasons of refusal whose names mean in a value table that the signal itself has no value."""
+REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error", "second_sender": "bad_counter"}
+"""Names in the value table for reasons of refusal: the signal itself has no value, or a code that older DBCs have."""
 
 HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",

@@ -51,6 +51,9 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
             return "; ".join(said * bool(silent) + unmapped * ("wheels" in names))
         case "input_stale":
             return f"{what} had pauses: check the sender and the wiring, or set a timeout that fits its rate"
+        case "input_rejected":
+            what = ", ".join(name for name in names if not name.startswith("("))
+            return f"{what}: the counters do not go on by one: look for a second sender, or for lost frames"
         case "implausible":
             return f"{what} contradicts the other sensors: check mounting, sign, scale and wiring"
         case "model_mismatch":

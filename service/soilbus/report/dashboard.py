@@ -15,7 +15,7 @@ from typing import NamedTuple
 from rich.style import Style
 
 from soilbus.config.model import Config
-from soilbus.report.received_frames import ReceivedFrames
+from soilbus.report.received_frames import IN_A_ROW, ReceivedFrames
 
 __all__ = ["Dashboard", "Vehicle", "Verdict", "force", "percent"]
 
@@ -248,8 +248,12 @@ class Dashboard:
     def _unknown(self) -> tuple[str, str]:
         """Why the state is unknown, and what to do."""
         known = self.known
+        if known.has_second_sender:
+            return REASONS["foreign_sender"]
         if known.is_stale("Traversability"):
             return "its frames stopped", GONE_ADVICE
+        if known.is_unproven:
+            return f"waiting for {IN_A_ROW} frames in a row", MEASURING
         reason = str(known.value("SoilbusStatus", "Reason"))
         left = self.until_first_window()
         if left is not None and reason in ("none", "None", "not_excited", "model_gap"):

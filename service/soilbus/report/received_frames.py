@@ -1,15 +1,20 @@
-"""Received frames: the last good frame of each message, and whether it is fresh.
+"""Received frames: the last good frame of each message, whether it is fresh, and the verdict that may be shown.
 
-    stale  if  age > 3 cycle times + 0.2 s
+    stale    if  age > 3 cycle times + 0.2 s
+    verdict   =  unknown or no_go as the last frame says it, else the least of the last five frames in a row
 
 The rules are those of dbc/README.md: a frame with a wrong checksum, a repeated counter or no layout counts as not
-received; a value outside the signal's range, not available or an error is None.
+received; a value outside the signal's range, not available or an error is None. The same counter with another payload
+shows a second sender.
 """
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import can
@@ -25,6 +30,57 @@ CYCLES_UNTIL_STALE = 3
 """Cycle times of the message after which its last frame is stale."""
 BUS_DELAY = 0.2
 """Time [s] beyond these cycles that a bus may take."""
+SECOND_SENDER_HOLD = 3.0
+"""Time [s] for which nothing is trusted after a second sender: as long as soilbus itself says so (dbc/README.md)."""
+IN_A_ROW = 5
+"""Frames in a row, each with the next counter, that go and caution need: in their 0.4 s soilbus itself has spoken."""
+LEAST_CYCLES = 2
+"""Cycles that these frames take at least: a faster second sender could send five between two frames of soilbus."""
+STATES = ("unknown", "no_go", "caution", "go")
+"""States of Traversability, the least first."""
+
+
+@dataclass(slots=True)
+class _Stream:
+    """What came of one message; times [s]."""
+
+    cycle: float
+    counter_modulus: int
+    values: dict[str, Any] = field(default_factory=dict)
+    data: bytes = b""
+    seen: float = -math.inf
+    distrusted_until: float = -math.inf
+    row: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=IN_A_ROW))
+    """Time and state of the last frames whose counters went on by one."""
+
+    def is_stale(self, now: float) -> bool:
+        """Whether no good frame came for CYCLES_UNTIL_STALE cycles, or none at all."""
+        return now - self.seen > CYCLES_UNTIL_STALE * self.cycle + BUS_DELAY
+
+    def take(self, now: float, data: bytes, values: dict[str, Any]) -> bool:
+        """Keep a frame with a right checksum; return whether its counter has moved."""
+        step = (values[COUNTER] - self.values[COUNTER]) % self.counter_modulus if self.values else None
+        if step == 0:
+            if data != self.data:
+                self.distrusted_until = now + SECOND_SENDER_HOLD
+                self.row.clear()
+            return False
+        if step == 1 and not self.is_stale(now):
+            state = str(values.get("State"))
+            self.row.append((now, state if state in STATES else STATES[0]))
+        else:
+            self.row.clear()
+        self.values, self.data, self.seen = values, data, now
+        return True
+
+    def verdict(self) -> str | None:
+        """Return the state to show: unknown and no_go at once, more only where the last frames in a row all say it."""
+        last = str(self.values["State"])
+        if last not in STATES[2:]:
+            return last if last in STATES else None
+        if len(self.row) < IN_A_ROW or self.row[-1][0] - self.row[0][0] < LEAST_CYCLES * self.cycle:
+            return STATES[0]
+        return min((state for _, state in self.row), key=STATES.index)
 
 
 class ReceivedFrames:
@@ -41,10 +97,11 @@ class ReceivedFrames:
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
         self._messages = {(m.frame_id, m.is_extended_frame): m for m in database.messages}
         self._signals = {m.name: {s.name: s for s in m.signals} for m in database.messages}
-        self._cycle = {m.name: (m.cycle_time or 1000) / 1000.0 for m in database.messages}
+        self._streams = {
+            m.name: _Stream((m.cycle_time or 1000) / 1000.0, 1 << self._signals[m.name][COUNTER].length)
+            for m in database.messages
+        }
         self._clock = clock
-        self._values: dict[str, dict[str, Any]] = {}
-        self._seen: dict[str, float] = {}
         self.bad_frames = 0
 
     @property
@@ -52,15 +109,19 @@ class ReceivedFrames:
         """Time [s] of the clock."""
         return self._clock()
 
+    @property
+    def has_second_sender(self) -> bool:
+        """Whether a second sender of any of our messages showed itself in the last SECOND_SENDER_HOLD."""
+        return self._clock() < max(stream.distrusted_until for stream in self._streams.values())
+
     def age(self, *messages: str) -> float | None:
         """Time [s] since the last good frame of any of these messages, or of any at all; None where there was none."""
-        seen = [self._seen[name] for name in messages or self._seen if name in self._seen]
-        return self._clock() - max(seen) if seen else None
+        seen = max(self._streams[name].seen for name in messages or self._streams)
+        return self._clock() - seen if math.isfinite(seen) else None
 
     def is_stale(self, message: str) -> bool:
         """Whether no good frame came for CYCLES_UNTIL_STALE cycles, or none at all."""
-        age = self.age(message)
-        return age is None or age > CYCLES_UNTIL_STALE * self._cycle[message] + BUS_DELAY
+        return self._streams[message].is_stale(self._clock())
 
     def receive(self, message: Received | can.Message) -> None:
         """Take one frame; a bad one (wrong checksum, repeated counter, not decodable) is counted and not used."""
@@ -69,7 +130,7 @@ class ReceivedFrames:
             return
         place = checkable_byte(layout)
         data = bytes(message.data)
-        if place is not None and data[place] != frame_checksum(message.arbitration_id, data, place):
+        if message.is_fd or (place is not None and data[place] != frame_checksum(message.arbitration_id, data, place)):
             self.bad_frames += 1
             return
         try:
@@ -77,28 +138,36 @@ class ReceivedFrames:
         except (DecodeError, ValueError):  # an output.dbc of the user's may have multiplexers
             self.bad_frames += 1
             return
-        if COUNTER in values and values[COUNTER] == self._values.get(layout.name, {}).get(COUNTER):
+        if not self._streams[layout.name].take(self._clock(), data, values):
             self.bad_frames += 1
-            return
-        self._values[layout.name] = values
-        self._seen[layout.name] = self._clock()
 
     def value(self, message: str, signal: str) -> float | str | None:
-        """A signal's value, or its name in the value table.
+        """A signal's value, or its name in the value table; the state of Traversability is the verdict to show.
 
         Returns
         -------
-        None where the frame is stale, or the value not available, an error or reserved.
+        None where the frame is stale or has a second sender, or the value is not available, an error or reserved.
         """
-        if self.is_stale(message):
+        stream, now = self._streams[message], self._clock()
+        if stream.is_stale(now):
             return None
-        value = self._values[message].get(signal)
+        if (message, signal) == ("Traversability", "State"):
+            return STATES[0] if self.has_second_sender else stream.verdict()
+        if now < stream.distrusted_until:
+            return None
+        value = stream.values.get(signal)
         if isinstance(value, NamedSignalValue):
             name = str(value)
             return None if name in ("not_available", "error") else name
         if value is None or _is_reserved(self._signals[message][signal], value):
             return None
         return float(value)
+
+    @property
+    def is_unproven(self) -> bool:
+        """Whether the last verdict received says more than may be shown, for want of frames in a row."""
+        stream = self._streams["Traversability"]
+        return bool(stream.values) and str(stream.values["State"]) in STATES[2:] and stream.verdict() == STATES[0]
 
     def number(self, message: str, signal: str) -> float | None:
         """A signal's value where it is a number."""
@@ -112,9 +181,10 @@ class ReceivedFrames:
         return value is not None and top is not None and value >= top
 
     def is_valid(self, message: str) -> bool:
-        """Whether a message may be acted on: it is fresh and its Status, where it has one, is valid."""
+        """Whether a message may be acted on: fresh, of one sender, and its Status, where it has one, is valid."""
         status = self.value(message, "Status")
-        return status == "valid" or "Status" not in self._values.get(message, {"Status": None})
+        has_status = "Status" in self._signals[message]
+        return not self.has_second_sender and (status == "valid" if has_status else not self.is_stale(message))
 
 
 def _is_reserved(signal: Signal, value: float) -> bool:

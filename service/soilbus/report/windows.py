@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from soilbus.can.doubts import doubts
 from soilbus.decision.traversability import State, Status
 from soilbus.grouping import grouped
 from soilbus.pipeline.pipeline import Pipeline
@@ -33,11 +34,17 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
     if pipeline.admission.missed:
         heard += f"; {pipeline.admission.missed} skipped by their counters"
-    return summary_of(results, heard, refusals.used, refusals.total, shows_no_slope(pipeline.config))
+    doubted = list(doubts(counts.received, counts.refused).values())
+    return summary_of(results, heard, refusals.used, refusals.total, shows_no_slope(pipeline.config), doubted)
 
 
 def summary_of(
-    results: Sequence[WindowResult], heard: str, used: int | None, refused: Counter[str], no_slope: bool = False
+    results: Sequence[WindowResult],
+    heard: str,
+    used: int | None,
+    refused: Counter[str],
+    no_slope: bool = False,
+    doubted: Sequence[str] = (),
 ) -> str:
     """Summary of windows from any source.
 
@@ -53,6 +60,8 @@ def summary_of(
         Samples refused by reason.
     no_slope
         Whether no sensor shows the slope.
+    doubted
+        Lines on messages that cannot be trusted.
     """
     good = [r for r in results if r.status is Status.VALID]
     estimated = len(of_use(results)) - len(good)
@@ -81,6 +90,7 @@ def summary_of(
     if used is not None:
         lines.append(f"samples {used + refused.total()}: used {used}, refused {refused.total()}")
     lines.append("refused samples " + counted(refused))
+    lines += doubted
     return "\n".join(lines) + "\n"
 
 

@@ -28,6 +28,7 @@ from soilbus.arrays import Array, Mask
 from soilbus.can.admission import Admission, Counts
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
+from soilbus.can.doubts import MEANING
 from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.can.units import SI, unit_of
 from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal
@@ -343,8 +344,8 @@ _REFUSAL: Mapping[Reason, str] = {
     Reason.IMPLAUSIBLE: "beyond what this vehicle can do ({low:.4g} to {high:.4g} {unit}): unit, factor, byte order?",
     Reason.SATURATED: "at the end of the range",
     Reason.NOT_VALID: "its `valid` signal does not vouch for it: right `valid_values`?",
-    Reason.BAD_CHECKSUM: "wrong Checksum: is it another maker's? (dbc.checked, dbc/README.md)",
-    Reason.BAD_COUNTER: "its Counter does not count as in dbc/README.md (dbc.checked)",
+    **MEANING,
+    Reason.BAD_COUNTER: "its Counter stands still, or is another maker's (dbc.checked, dbc/README.md)",
     Reason.WRONG_LENGTH: "frames of another length than the DBC says",
     Reason.TIME_BACKWARDS: "stamps that run backwards",
     Reason.BAD_TIME: "stamps that are no times",
@@ -399,9 +400,9 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
     if _is_absent(seen):
         return
     share = refused / (refused + seen.count)
-    if share > LIMITS.refused:
-        reason, n = max(seen.refused.items(), key=lambda item: item[1])
-        unit = SI.get(_dimension(channel), "")
+    said = {max(seen.refused, key=lambda reason: seen.refused[reason])} if share > LIMITS.refused else set()
+    for reason in sorted(said | ({Reason.SECOND_SENDER} & seen.refused.keys())):
+        n, unit = seen.refused[reason], SI.get(_dimension(channel), "")
         why = _REFUSAL.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
         text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
         yield Finding(text, share > 4.0 * LIMITS.refused, (channel.name,) if share > 4.0 * LIMITS.refused else ())
