@@ -18,6 +18,8 @@ from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
+from soilbus.words import shown
+
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -103,4 +105,4 @@ def output_fault() -> OSError | None:
 def say(text: str) -> None:
     """One line for the user, where there is still somebody to read it."""
     with suppress(OSError):
-        print(f"soilbus: {text}", file=sys.stderr, flush=True)
+        print(f"soilbus: {shown(text)}", file=sys.stderr, flush=True)

@@ -1,9 +1,40 @@
-"""Words of messages: the known name that was probably meant, and an error in one line."""
+"""Words of messages: foreign names as a terminal may have them, the known name that was probably meant."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+
+LONGEST_LINE = 5000
+"""Characters of a line that are shown: a path as long as Linux allows (PATH_MAX, 4096), and what is said of it."""
+
+LONGEST_NAME = 300
+"""Characters of a name that are shown: more than a file's name may have on usual file systems (NAME_MAX, 255)."""
+
+
+def shown(text: object, most: int = LONGEST_LINE) -> str:
+    """The text as one line for a terminal, a page or a cell: what is not printable by its code, the middle cut out.
+
+    Names of files, signals and vehicles may hold anything: escape sequences, line breaks, marks that turn the direction
+    of writing.  Applied again it changes nothing.
+
+    Examples
+    --------
+    >>> print(shown("red" + chr(27) + "[31m" + chr(10)))
+    red\\x1b[31m\\n
+    >>> shown("0123456789", 5)
+    '01…89'
+    """
+    line = str(text)
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    half = most // 2
+    return line if len(line) <= most else f"{line[: most - half - 1]}…{line[-half:]}"
+
+
+def text_of(lines: Iterable[object]) -> str:
+    """Lines as `shown`, each with its end."""
+    return "".join(f"{shown(line)}\n" for line in lines)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

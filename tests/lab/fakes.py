@@ -115,7 +115,6 @@ class Bench:
         keeper: StatePersistence | None = None,
         pipeline: Pipeline | None = None,
         clock: FakeClock | None = None,
-        outlet: Any = None,
         claim: Any = None,
     ) -> None:
         self.config = config or reference_configuration()
@@ -129,7 +128,7 @@ class Bench:
         self.service = Service(
             self.config, pipeline or Pipeline(self.config, load_databases(self.config)), self.bus,
             Publisher(self.database), notifier or Notifier(), workers or InlineExecutor(), self.clock,
-            self.results.append, lambda: keeper, self.clock.wait_for, outlet, claim,
+            self.results.append, lambda: keeper, self.clock.wait_for, claim,
         )  # fmt: skip
 
     def _open(self) -> Any:

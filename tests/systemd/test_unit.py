@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from soilbus.cli.arguments import command_line
+
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
 SERVICE = (UNITS / "soilbus@.service").read_text()
 LINK = (UNITS / "soilbus-link@.service").read_text()
@@ -181,6 +183,19 @@ def test_systemd_reads_the_units_without_a_complaint(installed: Path, name: str)
     done = _analyze(installed, "verify", f"./{name}")
     assert done.returncode == 0
     assert [line for line in done.stderr.splitlines() if "soilbus" in line] == []
+
+
+def test_the_unit_of_the_page_sends_results_on_as_a_user_of_its_own(installed: Path) -> None:
+    page = (UNITS / "README.md").read_text()
+    unit = next(text for text in re.findall(r"```ini\n(.*?)```", page, re.DOTALL) if "watch --json" in text)
+    assert "User=soilbus" not in unit
+    assert "DynamicUser=yes" in unit
+    name = "soilbus-mqtt@can0.service"
+    (installed / name).write_text(unit)
+    done = _analyze(installed, "verify", f"./{name}")
+    assert [line for line in done.stderr.splitlines() if "soilbus" in line] == []
+    words = unit.replace("\\\n", " ").partition("soilbus watch")[2].partition("|")[0].split()
+    assert command_line().parse_args(["watch", *words]).channel == "%i"
 
 
 @pytest.fixture

@@ -34,9 +34,9 @@ __all__ = [
     "Slot",
     "assigned",
     "candidates",
+    "described",
     "dimensions_of",
     "is_word_in",
-    "shown",
 ]
 
 WHEELS = ("FL", "FR", "RL", "RR")
@@ -280,7 +280,7 @@ def dimensions_of(role: str) -> tuple[str, ...]:
     return _ROLES[role][0]
 
 
-def shown(candidate: Candidate) -> str:
+def described(candidate: Candidate) -> str:
     """A candidate for a comment: path, unit and what speaks against it."""
     said = [candidate.unit] * bool(candidate.unit) + list(candidate.notes)
     return f"{candidate.path} ({', '.join(said)})" if said else candidate.path

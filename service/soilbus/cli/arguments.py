@@ -9,9 +9,18 @@ import argparse
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from soilbus import __version__
+from soilbus.words import shown
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors show names of files as a terminal may have them: a shell makes arguments of names."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and error, and leave with exit code 2."""
+        super().error(shown(message))
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
@@ -95,7 +104,7 @@ def named(*suffixes: str) -> Callable[[str], Path]:
 
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
-    parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
+    parser = _Parser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
     parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -230,7 +239,7 @@ def command_line() -> argparse.ArgumentParser:
         "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
     )
 
-    sub = command("batch", "many logs of many vehicles, on Dask (extra: batch)")
+    sub = command("batch", "many logs of many vehicles, on all cores or on a Dask cluster (extra: batch)")
     sub.add_argument(
         "logs", nargs="+", metavar="LOG",
         help="log, folder, glob, URL, or manifest: a CSV or Parquet file with log, vehicle, configuration, start",
@@ -239,7 +248,7 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="of Dask, such as tcp://10.0.0.1:8786; by default processes of this machine",
+        help="of Dask, such as tls://10.0.0.1:8786; by default processes of this machine, which open no port",
     )
     sub.add_argument("--resume", action="store_true", help="go on with DIR: logs that are done are not read again")
     sub.add_argument(
@@ -251,10 +260,15 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")
     sub.add_argument("log", nargs="?", type=Path, metavar="LOG", help="a recording of our frames, played in real time")
+    sub.add_argument("--channel", metavar="NAME", help="of the bus to listen to, such as can0 (default: bus.channel)")
     sub.add_argument(
         "--speed", type=between(0.1, 1000.0), default=1.0, metavar="X", help="play LOG X times as fast (default 1)"
     )
-    sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
+    lines = sub.add_mutually_exclusive_group()
+    lines.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
+    lines.add_argument(
+        "--json", action="store_true", help="a line of JSON for each window, for programs that send results on"
+    )
     sub.add_argument("--seconds", type=between(0.0, 1e6), metavar="S", help="stop after this time")
 
     sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")

@@ -354,7 +354,7 @@ def diagnose(args: argparse.Namespace) -> None:
 
 
 def batch(args: argparse.Namespace) -> None:
-    """`soilbus batch`: many logs, on Dask."""
+    """`soilbus batch`: many logs, on all cores or on a Dask cluster."""
     from soilbus.config.file import found_configuration, load_config
 
     def own(path: Path) -> Config:

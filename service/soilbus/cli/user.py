@@ -6,7 +6,9 @@ Each function takes the parsed arguments and imports what it needs, so that `run
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -65,14 +67,12 @@ def init(args: argparse.Namespace) -> None:
         found = weighed(found, recording)
         facts = facts_of(assigned(found), recording)
     files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
-    words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
-    made = proposal(database, assigned(found), facts, files, " ".join(words))
+    log = [] if args.log is None else ["--log", str(args.log)]
+    words = ["soilbus", "init", *(word for path in args.dbc for word in ("--dbc", str(path))), *log]
+    made = proposal(database, assigned(found), facts, files, shlex.join(words))
     write_text(args.out, made.text)
-    log = f" --log {args.log}" if args.log else ""
-    say(
-        f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then'
-        f" soilbus check --config {'soilbus.toml' if to_stdout else args.out}{log}"
-    )
+    then = shlex.join(["soilbus", "check", "--config", "soilbus.toml" if to_stdout else str(args.out), *log])
+    say(f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then {then}')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -150,15 +150,21 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 def watch(args: argparse.Namespace) -> None:
     """`soilbus watch`: the dashboard of the live bus or of a recording."""
     from soilbus.can.bus import BusError
+    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError
     from soilbus.report.watch import watch, watch_log
 
+    if args.channel is not None:
+        if args.log is not None:
+            raise ConfigError([f"--channel {args.channel}: {args.log} is a recording, which has no bus"])
+        args.set.append(f"bus.channel={json.dumps(args.channel)}")
     config, is_named = configured_or_reference(args), args.config is not None
+    how = is_named, args.seconds, args.plain, args.json
     try:
         if args.log is None:
-            watch(config, is_named, args.seconds, args.plain)
+            watch(config, *how)
         else:
-            watch_log(config, args.log, args.speed, is_named, args.seconds, args.plain)
+            watch_log(config, args.log, args.speed, *how)
     except (BusError, LogError) as error:
         raise WorkError(str(error)) from None
 

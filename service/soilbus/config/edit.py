@@ -1,4 +1,4 @@
-"""A configuration file with other effects: all else stays as it is, comments included."""
+"""Configurations as tomlkit writes them: a file with other effects, where all else stays, comments included."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import tomlkit
+from tomlkit import TOMLDocument
 
 from soilbus.config.file import load_config, located, overridden
+from soilbus.config.model import ConfigError
+from soilbus.words import shown
 
 EffectTable = Mapping[str, Any]
 """name, and for each parameter {value, std} or, where wheels have their own, such a table for each wheel."""
@@ -55,7 +58,7 @@ def _array(effects: Sequence[EffectTable], notes: Sequence[str]) -> Any:
     for effect in effects:
         array.add_line(_inline(effect))
     for note in notes:
-        array.add_line(comment=note)
+        array.add_line(comment=shown(note))
     if effects or notes:
         array.add_line(indent="")
     return array
@@ -75,7 +78,20 @@ def _from(place: Path, folder: Path, name: str) -> str:
 
 
 def named_from(place: Path, file: Path) -> str:
-    """How a configuration in a folder calls a DBC file: ours, or one beside it, by its name alone."""
-    if located(place, file.name).resolve() == file.resolve():
-        return file.name
-    return os.path.relpath(file.resolve(), place.resolve())
+    """How a configuration in a folder calls a DBC file: ours, or one beside it, by its name alone.
+
+    Raises ConfigError for a name that TOML cannot hold.
+    """
+    is_beside = located(place, file.name).resolve() == file.resolve()
+    name = file.name if is_beside else os.path.relpath(file.resolve(), place.resolve())
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise ConfigError([f"{name}: not UTF-8, so no TOML file can name it: rename it"]) from None
+    return name
+
+
+def toml_text(document: TOMLDocument) -> str:
+    """The text of a document whose comments are printable; in its texts, what is not stands as an escape of TOML."""
+    lines = tomlkit.dumps(document).split("\n")
+    return "\n".join("".join(c if c.isprintable() else f"\\U{ord(c):08X}" for c in line) for line in lines)

@@ -87,6 +87,8 @@ def _text(error: Any) -> str:
 
 def _unknown_key(location: Sequence[Any]) -> str:
     """Where the key belongs, if it is one of another section of the machine, or else which one was meant."""
+    if tuple(location) in _LEFT:
+        return _LEFT[tuple(location)]
     key = str(location[-1])
     tables = [name for name in _OF_MACHINE if key in _keys((name,))]
     places = [f"[[{name}]]" if name in _REPEATED else f"[{name}]" for name in tables]
@@ -95,6 +97,13 @@ def _unknown_key(location: Sequence[Any]) -> str:
     return f"unknown key{did_you_mean(key, _keys(location[:-1]))}"
 
 
+_LEFT: Mapping[tuple[Any, ...], str] = {
+    ("mqtt",): (
+        "the service holds no connection to a network: remove this section; soilbus watch --json prints the results"
+        " for mosquitto_pub -l (soilbus docs systemd)"
+    )
+}
+"""What replaces a section that earlier versions had."""
 _REPEATED = ("axle", "wheel", "track")
 _OF_MACHINE = ("vehicle", *_REPEATED, "signals")
 

@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from soilbus.grouping import grouped
-from soilbus.words import did_you_mean
+from soilbus.words import did_you_mean, shown
 
 __all__ = [
     "J1939",
@@ -40,7 +40,6 @@ __all__ = [
     "Estimator",
     "Form",
     "Model",
-    "Mqtt",
     "Noise",
     "NoiseOfChannels",
     "Output",
@@ -68,13 +67,8 @@ class ConfigError(Exception):
     """The configuration cannot be used; `faults` holds one line for each fault, without line breaks of names."""
 
     def __init__(self, faults: Iterable[str]) -> None:
-        self.faults = [_printable(fault) for fault in faults]
+        self.faults = [shown(fault) for fault in faults]
         super().__init__("\n".join(self.faults))
-
-
-def _printable(text: str) -> str:
-    """The text with line breaks and other control characters as Python writes them."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 @dataclass(frozen=True)
@@ -885,33 +879,6 @@ class J1939(_Section):
     """2: agriculture and forestry."""
 
 
-class Mqtt(_Section):
-    """A broker that each window is published to, as JSON; only `soilbus run`, and only where this section stands.
-
-    Username and password are not written here: SOILBUS_MQTT_USERNAME and SOILBUS_MQTT_PASSWORD in the environment, or
-    systemd's credentials `mqtt-username` and `mqtt-password`.
-    """
-
-    host: Annotated[str, Field(min_length=1)]
-    """Name or address of the broker."""
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """By default 1883, with `tls` 8883."""
-    topic: Annotated[str, Field(pattern=r"^[^#+\s/]+(/[^#+\s/]+)*$")] = "soilbus"
-    """`TOPIC/window` and `TOPIC/status` are published."""
-    rate: Annotated[PositiveFloat, Field(le=10.0)] = 1.0
-    """Windows a second at most; those in between are left out."""
-    tls: bool = False
-    """Encrypted, the broker's certificate checked."""
-    ca: str | None = None
-    """File of the certificate authority for `tls`, beside the configuration; by default the system's."""
-
-    @model_validator(mode="after")
-    def _ca_with_tls(self) -> Mqtt:
-        if self.ca is not None and not self.tls:
-            raise ValueError("ca has no meaning without tls = true")
-        return self
-
-
 class Config(_Section):
     """The whole configuration."""
 
@@ -931,7 +898,6 @@ class Config(_Section):
     model: Model = Model()
     output: Output = Output()
     j1939: J1939 = J1939()
-    mqtt: Mqtt | None = None
     folder: Path = Field(default=Path("."), exclude=True)
 
     @model_validator(mode="before")

@@ -47,7 +47,6 @@ from soilbus.pipeline.states import ServiceState, state_after
 
 if TYPE_CHECKING:
     from soilbus.daemon.address_claim import AddressClaim
-    from soilbus.daemon.mqtt import MqttOutlet
     from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.decision.capability import OverSlip
     from soilbus.estimation.gaussian import Gaussian
@@ -96,8 +95,6 @@ class Service:
         Called in the worker before the first window; returns the stored state of the last run, or None.
     waiting
         Waits for a future, for at most the seconds given (as WorkQueue).
-    outlet
-        Takes each window's result beside the bus; None without [mqtt].
     claim
         Of our source address; None where [j1939] asks for none.
 
@@ -118,7 +115,6 @@ class Service:
         on_window: Callable[[WindowResult], None] | None = None,
         open_persistence: Callable[[], StatePersistence | None] = lambda: None,
         waiting: Callable[[Future[WindowResult], float], None] = wait_for,
-        outlet: MqttOutlet | None = None,
         claim: AddressClaim | None = None,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
@@ -127,7 +123,7 @@ class Service:
         self._guarded_estimator = GuardedEstimator(self._first_estimator, pipeline.new_estimator)
         self._persistence: StatePersistence | None = None
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
-        self._outlet, self._claim, self._claimed_after = outlet, claim, bus.counts.reopened
+        self._claim, self._claimed_after = claim, bus.counts.reopened
         self.result: WindowResult | None = None
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
@@ -197,9 +193,8 @@ class Service:
         self.bus.close()
         if self._persistence is not None:
             self._persistence.close(self.newest_posterior, self._totals())
-        for beside in (self._outlet, self._claim):
-            if beside is not None:
-                beside.close()
+        if self._claim is not None:
+            self._claim.close()
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -275,8 +270,6 @@ class Service:
                     self._send(message, values)
             if self.on_window is not None:
                 self.on_window(result)
-            if self._outlet is not None:
-                self._outlet.put(result)
 
     def _send(self, message: str, values: Mapping[str, Any]) -> None:
         """One of our frames, unless our address is not ours."""
@@ -556,9 +549,8 @@ class Service:
                 log.warning("%s", line)
         if health := health_text(self.bus.state, self.bus.counts):
             text += f", bus: {health}"
-        for beside in (self._claim, self._outlet):
-            if beside is not None and (said := beside.status()):
-                text += f", {said}"
+        if self._claim is not None and (said := self._claim.status()):
+            text += f", {said}"
         self.notifier.status(text)
 
 

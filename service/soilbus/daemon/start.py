@@ -31,7 +31,6 @@ from soilbus.pipeline.result import WindowResult
 
 if TYPE_CHECKING:
     from soilbus.daemon.address_claim import AddressClaim
-    from soilbus.daemon.mqtt import MqttOutlet
     from soilbus.daemon.state_persistence import StatePersistence
 
 SWITCH_INTERVAL = 0.0005
@@ -67,7 +66,7 @@ def start_service(
     """
     pipeline, ours = Pipeline(config, load_databases(config, mapped_only=True)), output_database(config)
     check_cycle_times(config, ours)
-    outlet, claim = _outlet(config), _claim(config, ours)
+    claim = _claim(config, ours)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()
     filters = pipeline.admission.can_filters() + filters_of(ours) + ([] if claim is None else list(claim.filters))
@@ -87,20 +86,11 @@ def start_service(
         _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
-        open_persistence=partial(_state_persistence, pipeline, os.environ), outlet=outlet, claim=claim,
+        open_persistence=partial(_state_persistence, pipeline, os.environ), claim=claim,
     )  # fmt: skip
     if rehearse:
         workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
     return service
-
-
-def _outlet(config: Config) -> MqttOutlet | None:
-    """What [mqtt] asks for; nothing of it is loaded where the section is missing."""
-    if config.mqtt is None:
-        return None
-    from soilbus.daemon.mqtt import MqttOutlet
-
-    return MqttOutlet(config.mqtt, config)
 
 
 def _claim(config: Config, ours: Database) -> AddressClaim | None:

@@ -19,8 +19,11 @@ from soilbus.export.columns import SCHEMA_VERSION, Kind, column, is_part
 from soilbus.files import whole_file, whole_file_of_bytes
 from soilbus.pipeline.outputs import column_names, flat_record, window_record
 from soilbus.pipeline.result import WindowResult
+from soilbus.words import shown
 
 Rows = Sequence[Mapping[str, Any]]
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""First characters of a text that spreadsheets take for a formula (OWASP, CSV injection)."""
 
 
 def write_table(path: Path, results: Iterable[WindowResult], config: Config) -> None:
@@ -42,9 +45,17 @@ def write_table(path: Path, results: Iterable[WindowResult], config: Config) -> 
 
 def write_csv(out: Any, rows: Rows) -> None:
     """Write rows with a head of column names; what is not known is an empty cell."""
-    writer = csv.DictWriter(out, table_columns(rows), extrasaction="ignore", lineterminator="\n")
+    columns = table_columns(rows)
+    writer = csv.DictWriter(out, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: _cell(row.get(name)) for name in columns} for row in rows)
+
+
+def _cell(value: Any) -> Any:
+    """A text as `shown`, with an apostrophe before what a spreadsheet would compute; another value as it is."""
+    if not isinstance(value, str):
+        return value
+    return "'" * value.startswith(FORMULA) + shown(value)
 
 
 def parquet_of(rows: Rows) -> bytes:

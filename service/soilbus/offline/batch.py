@@ -1,4 +1,4 @@
-"""Many logs on Dask: each log its own task, its result on disk at once, what is done never done again.
+"""Many logs at once: each log its own task, its result on disk at once, what is done never done again.
 
     LOG...  ->  jobs  ->  parts/DIGEST.gz (one a log)  ->  windows, summaries, errors, map
 
@@ -44,6 +44,7 @@ from soilbus.offline.fleet import (
     no_findings,
 )
 from soilbus.offline.jobs import BatchError, jobs_of
+from soilbus.offline.local_workers import LocalWorkers, local_workers
 from soilbus.offline.parts import (
     WINDOWS_OF_PIECE,
     Job,
@@ -56,7 +57,7 @@ from soilbus.offline.parts import (
     summary_of_part,
 )
 from soilbus.pipeline.outputs import known
-from soilbus.words import one_line
+from soilbus.words import one_line, shown
 
 __all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch", "workers_watched"]
 
@@ -66,9 +67,6 @@ WORKERS_COUNTED_EVERY = 10.0
 """Seconds after which a scheduler is asked again whether it has workers; no evidence recorded."""
 TASKS_PER_THREAD = 3
 """Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
-WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
-"""Of the processes started here.  Dask's own has MALLOC_TRIM_THRESHOLD_ = 64 KiB too: glibc then gives memory back to
-the kernel all the time and has it zeroed again."""
 COMPARED = ("python", "dask", "distributed", "numpy")
 """Packages of which other versions may fail, or compute other last digits."""
 STATES_AT_ONCE = 32
@@ -122,12 +120,12 @@ class WorkerLost(Exception):
 
 @contextmanager
 def cluster(address: str | None, say: Callable[[str], None], processes: int | None = None) -> Iterator[Any]:
-    """A Dask client: of the scheduler at an address, or of one process for each core of this machine.
+    """A Dask client of the scheduler at an address, or processes of this machine that are used like one.
 
     Parameters
     ----------
     address
-        Such as tcp://10.0.0.1:8786; None for this machine.
+        Such as tcp://10.0.0.1:8786; None for this machine, where no port is opened.
     say
         Called with a line for the user.
     processes
@@ -138,6 +136,10 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
     BatchError
         There is no scheduler, it has no workers, or these have another soilbus.
     """
+    if address is None:
+        with local_workers(processes) as local:
+            yield local
+        return
     dask: Any = import_module("dask")
     distributed: Any = import_module("distributed")  # typed only in part
     # Dask speaks of every worker that is lost; what it means for a log we say ourselves
@@ -147,20 +149,8 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
     settings = {
         "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
         "distributed.client.scheduler-info-interval": 2000,
-        "distributed.worker.profile.enabled": False,  # it looks at the worker's threads a hundred times a second
-        "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
     }
     with dask.config.set(settings):
-        if address is None:
-            options = {"threads_per_worker": 1, "processes": True, "silence_logs": logging.CRITICAL}
-            here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-            with (
-                distributed.LocalCluster(n_workers=processes, **options, **here) as local,
-                distributed.Client(local) as client,
-            ):
-                _announce(client, say)
-                yield client
-            return
         try:
             with warnings.catch_warnings(category=distributed.versions.VersionMismatchWarning, action="ignore"):
                 client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
@@ -256,6 +246,9 @@ def done_in_turn(
     BatchError
         The scheduler is lost.
     """
+    if isinstance(client, LocalWorkers):
+        yield from client.done_in_turn(function, tasks)
+        return
     as_completed: Any = import_module("distributed").as_completed
     waiting = iter(tasks)
     threads = sum(client.nthreads().values()) or 1
@@ -363,7 +356,12 @@ def run_batch(
         job.digest: summary for job in jobs if (summary := summary_of_part(_part_path(parts, job.digest))) is not None
     }
     errors = [
-        {"vehicle": job.vehicle, "log": job.log, "windows": summary["windows.all"] if summary else 0, "fault": fault}
+        {
+            "vehicle": job.vehicle,
+            "log": job.log,
+            "windows": summary["windows.all"] if summary else 0,
+            "fault": shown(fault),
+        }
         for job in jobs
         for summary in [summaries.get(job.digest)]
         if (fault := summary["fault"] if summary else of_logs[job.digest].fault)

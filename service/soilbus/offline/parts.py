@@ -16,17 +16,18 @@ import math
 import os
 import pickle
 import stat
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import SEEK_END, BytesIO
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from shutil import copyfileobj
-from tempfile import NamedTemporaryFile, TemporaryDirectory, TemporaryFile
+from tempfile import NamedTemporaryFile, TemporaryDirectory, TemporaryFile, gettempdir
 from typing import IO, Any
 
 from cantools.database.can import Database
@@ -37,7 +38,7 @@ from soilbus.config.file import located
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
-from soilbus.offline.replay import LogError, OtherBus, replay
+from soilbus.offline.replay import LogError, OtherBus, log_names, replay
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import flat_record, window_record
 from soilbus.pipeline.pipeline import Pipeline
@@ -307,11 +308,13 @@ def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int) -> Outcome:
     fault: LogError | None = None
     pipeline = None if database is None else Pipeline(config, database)
 
+    (label,) = log_names([path])
+
     def written() -> Iterator[bytes]:
         nonlocal fault
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
-                run = (result.log or "").removeprefix(path.name) if pipeline is None else ""  # of a table: its soil bed
+                run = (result.log or "").removeprefix(label) if pipeline is None else ""  # of a table: its soil bed
                 row = summary.row(replace(result, log=job.log + run))
                 yield json.dumps(row, allow_nan=False).encode() + b"\n"
         except LogError as error:
@@ -337,13 +340,20 @@ def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int) -> Outcome:
 
 
 def _left_here(lines: IO[bytes], sizes: tuple[int, ...]) -> Rest:
-    """The rest of a file, in the folder of the Dask worker that this runs on; it goes with the worker."""
-    from distributed import get_worker
-
-    worker = get_worker()
-    with NamedTemporaryFile(dir=worker.local_directory, delete=False) as file:
+    """The rest of a file, in the folder of the worker that this runs on; it goes with the worker."""
+    address, folder = _worker()
+    with NamedTemporaryFile(dir=folder, delete=False) as file:
         copyfileobj(lines, file)
-    return Rest(worker.address, file.name, sizes)
+    return Rest(address, file.name, sizes)
+
+
+def _worker() -> tuple[str, str]:
+    """Address and folder of the Dask worker that this runs on; of a process of a batch here its temporary folder."""
+    if (distributed := sys.modules.get("distributed")) is not None:
+        with suppress(ValueError):  # no worker
+            worker = distributed.get_worker()
+            return worker.address, worker.local_directory
+    return "", gettempdir()
 
 
 def piece_left(path: str, begin: int, size: int) -> bytes:

@@ -35,7 +35,7 @@ from soilbus.pipeline.estimator import Undecided, WindowEstimator
 from soilbus.pipeline.intake import Intake, WindowTask
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
-from soilbus.words import one_line
+from soilbus.words import LONGEST_NAME, one_line, shown
 from soilbus.workers import workers
 
 __all__ = ["LogError", "OtherBus", "estimator_beside", "fed", "log_names", "read_frames", "read_log", "replay"]
@@ -140,15 +140,19 @@ def _reader(path: Path) -> Any:
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:
-    """A name for each log: the shortest end of its path that no other log has; a log given twice has a number too."""
+    """A name for each log: the shortest end of its path that no other log has, as `shown`.
+
+    Logs whose names are alike all the same, as one that is given twice, have a number too.
+    """
     paths = [path.absolute().parts for path in logs]
     ends = Counter(parts[-n:] for parts in set(paths) for n in range(1, len(parts) + 1))
-    seen: Counter[tuple[str, ...]] = Counter()
+    seen: Counter[str] = Counter()
     names = []
     for parts in paths:
         n = next(n for n in range(1, len(parts) + 1) if ends[parts[-n:]] == 1)
-        seen[parts] += 1
-        names.append(str(Path(*parts[-n:])) + (f" ({seen[parts]})" if seen[parts] > 1 else ""))
+        name = shown(Path(*parts[-n:]), LONGEST_NAME)
+        seen[name] += 1
+        names.append(name + (f" ({seen[name]})" if seen[name] > 1 else ""))
     return names
 
 

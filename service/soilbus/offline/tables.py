@@ -36,7 +36,7 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import for_wheel
 from soilbus.terra.vehicle import slip_ratio
-from soilbus.words import one_line
+from soilbus.words import LONGEST_NAME, one_line, shown
 
 Columns = Mapping[str, Sequence[Any]]
 
@@ -129,7 +129,7 @@ def _runs(config: Config, columns: Columns, source: str, name: str) -> list[Run]
     values = {role: _numbers(source, columns, column, chosen) for role, column in table.columns.items()}
     names = [name] * len(chosen)
     if table.run is not None:
-        names = [f"{name}, {str(columns[table.run][row]).strip()}" for row in chosen]
+        names = [f"{name}, {shown(str(columns[table.run][row]).strip(), LONGEST_NAME)}" for row in chosen]
     rig, runs = rig_of(config), []
     for bed in dict.fromkeys(names):
         members = np.array([i for i, other in enumerate(names) if other == bed])

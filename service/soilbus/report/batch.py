@@ -8,6 +8,7 @@ from typing import Any
 
 from soilbus.offline.batch import Batch
 from soilbus.report.table import AT_EDGE, table, value_text
+from soilbus.words import shown, text_of
 
 MAX_ROWS = 40
 """Vehicles that the table lists; all are in vehicles.parquet."""
@@ -20,7 +21,7 @@ def batch_text(batch: Batch, out: Path) -> str:
     head = ("vehicle", "logs", "failed", "damaged", "hours", "windows", "valid", "pressure, kPa", "refused samples")
     text = table(head, [_row(row) for row in batch.vehicles[:MAX_ROWS]])
     if len(batch.vehicles) > MAX_ROWS:
-        text += f"and {len(batch.vehicles) - MAX_ROWS} more vehicles in {out / 'vehicles.parquet'}\n"
+        text += f"and {len(batch.vehicles) - MAX_ROWS} more vehicles in {shown(out / 'vehicles.parquet')}\n"
     logs, failed = sum(row["logs.all"] for row in batch.vehicles), sum(row["logs.failed"] for row in batch.vehicles)
     text += f"{logs - failed} of {logs} logs done, {batch.windows} windows"
     text += f"; {batch.resumed - batch.failed_before} logs were done before" if batch.resumed else ""
@@ -28,9 +29,9 @@ def batch_text(batch: Batch, out: Path) -> str:
     text += "\n"
     for error in batch.errors[:MAX_FAULTS]:
         kept = f" (the {error['windows']} windows before that are kept)" if error["windows"] else ""
-        text += f"  {error['fault']}{kept}\n"
+        text += text_of([f"  {error['fault']}{kept}"])
     if len(batch.errors) > MAX_FAULTS:
-        text += f"  and {len(batch.errors) - MAX_FAULTS} more in {out / 'errors.parquet'}\n"
+        text += f"  and {len(batch.errors) - MAX_FAULTS} more in {shown(out / 'errors.parquet')}\n"
     if batch.duration:
         hours = batch.duration / 3600.0
         text += (
@@ -63,7 +64,7 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
                 lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({_sizes(effect)}){since}")
         if vehicle["fault"]:
             lines.append(f"  {vehicle['vehicle']}: not diagnosed: {vehicle['fault']}")
-    return "\n".join(lines) + "\n"
+    return text_of(lines)
 
 
 def _sizes(effect: Mapping[str, Any]) -> str:

@@ -29,6 +29,7 @@ from soilbus.report.proposal import BEARING_STD_WITHOUT_CELLS
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
 from soilbus.sensors.survey import Seen, Survey
+from soilbus.words import shown, text_of
 
 
 def configuration_report(config: Config) -> str:
@@ -160,7 +161,7 @@ def survey_report(found: Survey) -> str:
     """Received values of every mapped signal beside the configuration, and what the recording cannot show."""
     rows = [_heard_row(seen, found) for seen in found.seen]
     head = ("role", "values", "every", "from", "median", "to", "unit", "refused", "beside the configuration")
-    return "\n" + table(head, rows) + "".join(f"cannot be decided: {line}\n" for line in found.open)
+    return "\n" + table(head, rows) + text_of(f"cannot be decided: {line}" for line in found.open)
 
 
 def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
@@ -204,7 +205,7 @@ def defaults_text(config: Config) -> str:
             for part in value:
                 walk(f"{prefix}.{part['name']}", {k: v for k, v in part.items() if k not in _LISTED})
         else:
-            lines.append(f"{prefix} = {value}")
+            lines.append(shown(f"{prefix} = {value}"))
 
     whole = config.model_dump(exclude={"signals", "folder"})
     tracks = {track["name"] for track in whole["track"]}

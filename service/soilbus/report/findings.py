@@ -37,6 +37,7 @@ from soilbus.report.statement import (
 from soilbus.report.table import AT_EDGE, table, value_text
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
+from soilbus.words import text_of
 
 MAX_PLACES = 8
 """Places of disagreement that the text lists."""
@@ -176,7 +177,7 @@ def findings_text(findings: Findings) -> str:
     if diagnosis.residual_terms:
         lines += ["", "what is left, described:", *(f"  {line}" for line in residual_lines(diagnosis.residual_terms))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
-    return "\n".join(lines) + "\n"
+    return text_of(lines)
 
 
 def gap_line(findings: Findings) -> str:

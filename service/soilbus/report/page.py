@@ -10,6 +10,7 @@ import base64
 import hashlib
 import io
 import shlex
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -23,6 +24,7 @@ from soilbus.config.file import MAX_FILE_BYTES
 from soilbus.config.model import Config, Wheel
 from soilbus.files import read_bounded
 from soilbus.offline.replay import log_names
+from soilbus.words import shown
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -35,7 +37,7 @@ DPI = 160
 STYLE = {
     "font.size": 11, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False,
     "axes.grid": True, "grid.color": "0.9", "axes.axisbelow": True, "legend.fontsize": 9.5, "legend.framealpha": 0.9,
-    "hatch.linewidth": 0.8,
+    "hatch.linewidth": 0.8, "text.parse_math": False,
 }  # fmt: skip
 DIGEST_DIGITS = 16
 """Hexadecimal digits of a configuration's SHA-256 that a report shows."""
@@ -159,8 +161,15 @@ def _environment() -> Environment:
 
     return Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
+        trim_blocks=True, lstrip_blocks=True, finalize=_printable,
     )  # fmt: skip
+
+
+def _printable(value: Any) -> Any:
+    """What a template prints: texts line by line as `shown`; markup stays markup."""
+    if not isinstance(value, str) or value.isprintable():
+        return value
+    return type(value)("\n".join(shown(line, len(line)) for line in value.split("\n")))
 
 
 def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH, dpi: int = DPI) -> Picture:
@@ -184,5 +193,7 @@ def picture(draw: Callable[[Any], None], height: float, words: str, width: float
     with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(width, height), layout="constrained")
         draw(figure)
-        figure.savefig(png, format="png", dpi=dpi)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph")  # of a log's name; the page itself has it
+            figure.savefig(png, format="png", dpi=dpi)
     return Picture(words, base64.b64encode(png.getvalue()).decode())

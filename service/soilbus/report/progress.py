@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from soilbus.words import shown
+
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
@@ -24,9 +26,10 @@ def phases(title: str) -> Iterator[Callable[[str], None] | None]:
         yield None
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title)
-        yield lambda what: bar.update(task, description=f"{title}: {what}")
+        yield lambda what: bar.update(task, description=escape(shown(f"{title}: {what}")))

@@ -11,16 +11,21 @@ import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import tomlkit
 from cantools.database.can import Database, Message, Signal
+from tomlkit import TOMLDocument
+from tomlkit.items import Table
 
 from soilbus.can.mapping import VEHICLE_ROLES
-from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, dimensions_of, is_word_in, shown
+from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, described, dimensions_of, is_word_in
 from soilbus.can.validity import vouching_codes
+from soilbus.config.edit import toml_text
 from soilbus.config.file import OPEN
 from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts, is_absent
+from soilbus.words import shown
 
 __all__ = ["Proposal", "proposal"]
 
@@ -45,33 +50,54 @@ class Proposal(NamedTuple):
 
 @dataclass
 class _Draft:
-    """What is known of the vehicle, the lines so far, and the signals that they map or name."""
+    """What is known of the vehicle, the document so far, and the signals that it maps or names."""
 
     database: Database
     assignment: Assignment
     facts: Facts
-    lines: list[str] = field(default_factory=list)
+    document: TOMLDocument = field(default_factory=tomlkit.document)
     used: set[str] = field(default_factory=set)
     named: set[str] = field(default_factory=set)
     axles: tuple[str, ...] = ()
+    open: int = 0
 
-    def put(self, key: str, value: str, comment: str = "") -> None:
-        line = f"{key} = {value}"
-        self.lines.append(f"{line:<{COLUMN - 2}}  # {comment}" if comment else line)
+    def __post_init__(self) -> None:
+        self._here: TOMLDocument | Table = self.document
+
+    def put(self, key: str, value: Any, comment: str = "") -> None:
+        """A key of the section, with a comment beside it."""
+        item = tomlkit.item(value)
+        self.open += _open_values(value)
+        if comment:
+            item.comment(shown(comment))
+            item.trivia.comment_ws = " " * max(2, COLUMN - len(f"{key} = {item.as_string()}"))
+        self._here.add(key, item)
 
     def put_open(self, key: str, comment: str) -> None:
-        self.put(key, f'"{OPEN}"', comment)
+        self.put(key, OPEN, comment)
 
     def put_choice(self, key: str, found: Sequence[Candidate], else_text: str) -> None:
         """An open role with its candidates."""
         self.named.update(c.path for c in found)
         self.put_open(key, _listed(found) or else_text)
 
-    def note(self, text: str) -> None:
-        self.lines.append(f"# {text}")
+    def note(self, *texts: str, apart: bool = False) -> None:
+        """A comment for each text, below an empty line where they stand apart."""
+        if apart:
+            self._here.add(tomlkit.nl())
+        for text in texts:
+            self._here.add(tomlkit.comment(shown(text)))
 
-    def section(self, name: str) -> None:
-        self.lines += ["", name]
+    def section(self, name: str, repeated: bool = False) -> None:
+        """Begin a section, or one more of that name."""
+        self._here = tomlkit.table()
+        self._here.trivia.indent = "\n"
+        if not repeated:
+            self.document.add(name, self._here)
+            return
+        if name not in self.document:
+            self.document.add(name, tomlkit.aot())
+        self.document[name].append(self._here)
 
     def matched(self, role: str, place: str = "") -> Candidate | None:
         return self.assignment.asserted.get(Slot(role, place))
@@ -85,18 +111,27 @@ class _Draft:
         valid = _valid_signal(message, c)
         back = self.facts.backward.get(c.path)
         said = _said_backward(message, c)
-        parts = [f'signal = "{c.path}"', *(f"{k} = {_quoted(v)}" for k, v in more.items())]
-        parts += [] if valid is None else [f"valid = {_quoted(valid.name)}", *_valid_values(valid)]
-        parts += ["sign = -1"] * bool(back or said)
-        value = f"{{ {', '.join(parts)} }}" if len(parts) > 1 else f'"{c.path}"'
+        value = tomlkit.inline_table()
+        value.update({"signal": c.path, **more})
+        if valid is not None:
+            value["valid"] = valid.name
+            if valid.choices:
+                value["valid_values"] = list(vouching_codes(valid)) or OPEN
+        if back or said:
+            value["sign"] = -1
         remarks = [f"negative in {back} in the log"] if back else [f"the DBC: {said}"] if said else []
         if state and c.slot.role == "torque":
             remarks.append(f'does {state} vouch for it? then valid = "{state}", valid_values = [...]')
         if valid is not None and valid.choices and not vouching_codes(valid):
-            names = ", ".join(f'{code} "{" ".join(str(name).split())}"' for code, name in sorted(valid.choices.items()))
+            names = ", ".join(f'{code} "{name}"' for code, name in sorted(valid.choices.items()))
             remarks.append(f"which of {names} vouch for it?")
         remarks += ["no unit in the DBC: SI assumed"] if not c.unit and c.dimension else []
-        self.put(key, value, "; ".join(remarks))
+        self.put(key, value if len(value) > 1 else c.path, "; ".join(remarks))
+
+
+def _open_values(value: Any) -> int:
+    """The number of values that are open in one of the file."""
+    return sum(map(_open_values, value.values())) if isinstance(value, Mapping) else int(value == OPEN)
 
 
 def proposal(database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str) -> Proposal:
@@ -114,12 +149,15 @@ def proposal(database: Database, assignment: Assignment, facts: Facts, files: Se
         The command, for the first line.
     """
     draft = _Draft(database, _one_layout(assignment), facts)
-    draft.lines += [
-        f"# Proposed by `{' '.join(origin.split())}`: read each line.",
-        f'# "{OPEN}" is open: put the value in its place. `soilbus check` names every line that is still open.',
-        "", "[bus]", 'interface = "socketcan"', 'channel = "can0"',
-        "", "[dbc]", f"input = [{', '.join(_quoted(name) for name in files)}]",
-    ]  # fmt: skip
+    draft.note(
+        f"Proposed by `{origin}`: read each line.",
+        f'"{OPEN}" is open: put the value in its place. `soilbus check` names every line that is still open.',
+    )
+    draft.section("bus")
+    draft.put("interface", "socketcan")
+    draft.put("channel", "can0")
+    draft.section("dbc")
+    draft.put("input", list(files))
     _put_vehicle(draft)
     layout = _layout_of(draft)
     draft.axles = layout.axles
@@ -129,9 +167,7 @@ def proposal(database: Database, assignment: Assignment, facts: Facts, files: Se
         _put_wheel(draft, wheel, layout)
     _put_signals(draft)
     _put_rest(draft)
-    text = "\n".join(draft.lines) + "\n"
-    left = sum(line.count(f'"{OPEN}"') for line in draft.lines if not line.startswith("#"))
-    return Proposal(text, len(draft.used), left)
+    return Proposal(toml_text(draft.document), len(draft.used), draft.open)
 
 
 # --- which motor drives what ---
@@ -183,7 +219,7 @@ def _layout_of(draft: _Draft) -> _Layout:
 
 
 def _put_vehicle(draft: _Draft) -> None:
-    draft.section("[vehicle]")
+    draft.section("vehicle")
     mass = f"; the loads sum to {draft.facts.mass:.0f} kg in the log" if math.isfinite(draft.facts.mass) else ""
     draft.put_open("mass", f"kg with ballast, tank and driver{mass}")
     draft.put_open("wheelbase", "m, front to rear axle")
@@ -200,10 +236,10 @@ def _put_vehicle(draft: _Draft) -> None:
 
 
 def _put_axle(draft: _Draft, axle: str) -> None:
-    draft.section("[[axle]]")
+    draft.section("axle", repeated=True)
     place = axle
     if axle:
-        draft.put("name", _quoted(axle))
+        draft.put("name", axle)
     else:
         above = "; where that stands above, move its load here" if len(draft.axles) > 1 else ""
         draft.put_open("name", f'axle that this motor drives: "front", "rear" or "both"{above}')
@@ -230,9 +266,9 @@ def _put_axle(draft: _Draft, axle: str) -> None:
 
 def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
     axle = "front" if wheel.startswith("F") else "rear"
-    draft.section("[[wheel]]")
-    draft.put("name", _quoted(wheel))
-    draft.put("axle", _quoted(axle))
+    draft.section("wheel", repeated=True)
+    draft.put("name", wheel)
+    draft.put("axle", axle)
     radius = draft.facts.radius.get(wheel)
     seen = f"; radius * (1 - slip) is {radius:.2f} in the log" if radius else ""
     draft.put_open("radius", f"m, rolling radius{seen}")
@@ -302,7 +338,7 @@ def _side(torque: Candidate) -> dict[str, str]:
 
 
 def _put_signals(draft: _Draft) -> None:
-    draft.section("[signals]")
+    draft.section("signals")
     draft.note("positive: ground speed and torque forward, draft backward, pitch nose up, yaw left, roll left side up")
     for role in VEHICLE_ROLES:
         c = draft.matched(role)
@@ -326,32 +362,30 @@ def _put_signals(draft: _Draft) -> None:
 def _put_rest(draft: _Draft) -> None:
     """Limits without load cells, noise, and candidates that no line names."""
     if not all(draft.matched("load", wheel) for wheel in WHEELS):
-        draft.section("[estimator]")
+        draft.section("estimator")
         draft.put(
             "max_bearing_std",
-            f"{BEARING_STD_WITHOUT_CELLS:g}",
+            BEARING_STD_WITHOUT_CELLS,
             "a window without load cells knows the bearing pressure to 10 to 20 %",
         )
-    draft.lines += [
-        "",
-        "# [noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold",
-    ]
+    draft.note(
+        "[noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold", apart=True
+    )
     known = draft.assignment
     found = [*(c for cs in known.open.values() for c in cs), *known.asserted.values(), *known.rivals]
     rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
     if perhaps := grouped((c for c in rest.values() if not is_absent(c)), lambda c: c.slot.role):
-        draft.lines += ["", "# Not used, but perhaps:"]
-        draft.lines += [f"#   {role}: {_listed(cs)}" for role, cs in perhaps.items()]
+        draft.note("Not used, but perhaps:", *(f"  {role}: {_listed(cs)}" for role, cs in perhaps.items()), apart=True)
     unnamed: dict[str, list[Candidate]] = {}
     for c in known.unnamed:
         if c.path not in draft.used | draft.named and not is_absent(c):
             unnamed.setdefault(c.dimension, []).append(c)
     if unnamed:
-        draft.lines += ["", "# Of no role that a name says; by their units:"]
-        draft.lines += [f"#   {dimension}: {_listed(cs)}" for dimension, cs in unnamed.items()]
+        lines = (f"  {dimension}: {_listed(cs)}" for dimension, cs in unnamed.items())
+        draft.note("Of no role that a name says; by their units:", *lines, apart=True)
     if absent := sorted(path for path, c in rest.items() if is_absent(c)):
-        text = textwrap.fill(", ".join(absent), 116, break_long_words=False)
-        draft.lines += ["", "# In the DBC, but never in the log:", *(f"#   {line}" for line in text.splitlines())]
+        lines = (f"  {line}" for line in textwrap.wrap(", ".join(absent), 116, break_long_words=False))
+        draft.note("In the DBC, but never in the log:", *lines, apart=True)
 
 
 # --- words ---
@@ -370,7 +404,7 @@ def _of_role(draft: _Draft, role: str, place: str) -> list[Candidate]:
 def _listed(found: Iterable[Candidate]) -> str:
     known = list(found)
     more = f", and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
-    return ", ".join(shown(c) for c in known[:MOST_LISTED]) + more
+    return ", ".join(described(c) for c in known[:MOST_LISTED]) + more
 
 
 def _kind_by_words(database: Database, c: Candidate) -> str:
@@ -402,23 +436,10 @@ def _valid_signal(message: Message, c: Candidate) -> Signal | None:
     return found[0] if len(found) == 1 else None
 
 
-def _valid_values(valid: Signal) -> list[str]:
-    """The codes that vouch by the value table, open where its names do not say; nothing without a table."""
-    if not valid.choices:
-        return []
-    codes = list(vouching_codes(valid))
-    return [f"valid_values = {codes}" if codes else f'valid_values = "{OPEN}"']
-
-
-def _rounded(ratio: float) -> str:
-    short = f"{ratio:.3g}"
-    text = short if abs(float(short) / ratio - 1.0) < ROUNDING else f"{ratio:.4g}"
-    return text if "." in text else f"{text}.0"
+def _rounded(ratio: float) -> float:
+    short = float(f"{ratio:.3g}")
+    return short if abs(short / ratio - 1.0) < ROUNDING else float(f"{ratio:.4g}")
 
 
 ROUNDING = 0.001
 """Relative change by which a measured gear ratio may be rounded: gain errors of two speed sensors."""
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from soilbus.words import LONGEST_NAME, shown
+
 AT_EDGE = "at the edge of its range"
 """Why an effect's parameter that was found has no standard deviation."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Left-aligned columns under a ruled head, one line a row."""
-    lines = [tuple(head), *(tuple(row) for row in rows)]
+    lines = [tuple(shown(cell, LONGEST_NAME) for cell in line) for line in (head, *rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
     text = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
     text.insert(1, "  ".join("-" * w for w in widths))

@@ -2,10 +2,12 @@
 
 source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second; keys change the page
                                                    -> lines, for a screen reader and where there is no terminal
+                                                   -> JSON, a line a window, for programs that send it on
 """
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import sys
@@ -15,7 +17,7 @@ import tty
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Protocol
 
 import can
 from rich.console import Console, Group
@@ -32,13 +34,17 @@ from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.driver_page import driver_page
 from soilbus.report.engineer_page import engineer_page
 from soilbus.report.received_frames import ReceivedFrames
+from soilbus.report.received_record import gist, received_record
+from soilbus.words import shown
 
-__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "show", "watch", "watch_log"]
+__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch", "watch_log"]
 
 REDRAW_PERIOD = 0.2
 """Time [s] between two pictures."""
 LINE_PERIOD = 1.0
 """Least time [s] between two lines of which only figures differ."""
+FIRST_VERDICT = 0.5
+"""Time [s] after the start by which a verdict has come: three cycles of the fast frames, and what a bus may take."""
 PAGES = {"driver": driver_page, "engineer": engineer_page}
 
 
@@ -106,7 +112,35 @@ class PlayedLog:
         return message
 
 
-def watch(config: Config, names_wheels: bool = True, seconds: float | None = None, plain: bool = False) -> None:
+class Pace:
+    """Time [s] of a recording that is played: it goes on by `sleep` alone, so that no pause of ours is a silence.
+
+    Parameters
+    ----------
+    speed
+        Seconds of the recording per second.
+    """
+
+    def __init__(self, speed: float) -> None:
+        self._speed, self._began, self._now = speed, time.monotonic(), 0.0
+
+    def __call__(self) -> float:
+        """The present time [s]."""
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        """Let this time of the recording pass, and as much of ours as belongs to it."""
+        self._now += seconds
+        time.sleep(max(0.0, self._began + self._now / self._speed - time.monotonic()))
+
+
+def watch(
+    config: Config,
+    names_wheels: bool = True,
+    seconds: float | None = None,
+    plain: bool = False,
+    as_json: bool = False,
+) -> None:
     """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
 
     Parameters
@@ -119,6 +153,8 @@ def watch(config: Config, names_wheels: bool = True, seconds: float | None = Non
         After which to stop; None for never.
     plain
         Lines, even on a terminal.
+    as_json
+        A line of JSON for each window.
 
     Raises
     ------
@@ -131,7 +167,7 @@ def watch(config: Config, names_wheels: bool = True, seconds: float | None = Non
         bus.open()
         until = None if seconds is None else time.monotonic() + seconds
         dashboard = Dashboard(ReceivedFrames(database), Vehicle.of(config, names_wheels))
-        show(dashboard, bus, Console(), plain, lambda: until is not None and time.monotonic() >= until)
+        _show_as(dashboard, bus, plain, as_json, lambda: until is not None and time.monotonic() >= until)
 
 
 def watch_log(
@@ -141,12 +177,13 @@ def watch_log(
     names_wheels: bool = True,
     seconds: float | None = None,
     plain: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Show the dashboard of a recording of our frames in its own time; the end of the recording ends it.
 
     Parameters
     ----------
-    config, names_wheels, seconds, plain
+    config, names_wheels, seconds, plain, as_json
         As of `watch`.
     log
         In any format that python-can reads.
@@ -160,15 +197,24 @@ def watch_log(
     """
     database = output_database(config)
     ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
-    source = PlayedLog((m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours), speed)
+    messages = (m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours)
+    pace = Pace(speed)
+    source = PlayedLog(messages, 1.0, pace, pace.sleep) if as_json else PlayedLog(messages, speed)
     if source.is_over:
         raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
     until = None if seconds is None else time.monotonic() + seconds
     dashboard = Dashboard(ReceivedFrames(database, source.now), Vehicle.of(config, names_wheels))
-    show(
-        dashboard, source, Console(), plain,
+    _show_as(
+        dashboard, source, plain, as_json,
         lambda: source.is_over or (until is not None and time.monotonic() >= until),
     )  # fmt: skip
+
+
+def _show_as(dashboard: Dashboard, source: Source, plain: bool, as_json: bool, done: Callable[[], bool]) -> None:
+    if as_json:
+        print_results(dashboard, source, sys.stdout, done)
+    else:
+        show(dashboard, source, Console(), plain, done)
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
@@ -240,12 +286,48 @@ def _show_lines(
             console.file.flush()
 
 
-def _take(dashboard: Dashboard, source: Source, timeout: float) -> None:
+def print_results(
+    dashboard: Dashboard,
+    source: Source,
+    out: IO[str],
+    done: Callable[[], bool] = lambda: False,
+) -> None:
+    """Print a line of JSON for each window that is received, and for each change of state between two, until `done`.
+
+    A window's line waits for the verdict that rests on it, at most a cycle of the fast frames.
+
+    Parameters
+    ----------
+    dashboard, source, done
+        As of `show`.
+    out
+        Takes the lines; each is flushed.
+    """
+    received, said, stamp = dashboard.known, None, None
+    first = received.now + FIRST_VERDICT
+    while not done():
+        before = received.age("Traversability")
+        message = _take(dashboard, source, REDRAW_PERIOD)
+        stamp = stamp if message is None else message.timestamp
+        age = received.age("Traversability")
+        is_new = age is not None and (before is None or age < before)
+        if not is_new and not (received.is_stale("Traversability") and received.now >= first):
+            continue
+        record = received_record(dashboard, stamp)
+        if gist(record) != said:
+            said = gist(record)
+            out.write(json.dumps(record, allow_nan=False) + "\n")
+            out.flush()
+
+
+def _take(dashboard: Dashboard, source: Source, timeout: float) -> Received | can.Message | None:
+    """Feed the next frame, if one comes in time."""
     message = source.receive(max(0.0, timeout))
-    dashboard.fault = source.fault
+    dashboard.fault = shown(source.fault)
     if message is not None:
         dashboard.known.receive(message)
         dashboard.sample()
+    return message
 
 
 @contextmanager

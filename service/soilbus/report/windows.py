@@ -18,6 +18,7 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
 from soilbus.report.configuration import NO_SLOPE, shows_no_slope
+from soilbus.words import text_of
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
@@ -90,8 +91,7 @@ def summary_of(
     if used is not None:
         lines.append(f"samples {used + refused.total()}: used {used}, refused {refused.total()}")
     lines.append("refused samples " + counted(refused))
-    lines += doubted
-    return "\n".join(lines) + "\n"
+    return text_of([*lines, *doubted])
 
 
 def unused(results: Sequence[WindowResult]) -> int:

@@ -1,0 +1,112 @@
+"""What was received as one object for JSON: the keys of `replay --json` where the quantity is the same, SI units.
+
+The reading rules of dbc/README.md hold: what is stale, refused, not available or an error is None.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from soilbus.pipeline.outputs import PARAMETER_FRAMES, known
+from soilbus.report.dashboard import Dashboard
+from soilbus.report.received_frames import ReceivedFrames
+
+__all__ = ["gist", "received_record"]
+
+COUNTS = {
+    "reopened": "Reopened",
+    "overruns": "Overruns",
+    "dropped": "Dropped",
+    "foreign_frames": "ForeignFrames",
+    "error_frames": "ErrorFrames",
+}
+"""Keys and signals of BusHealth that are counts."""
+
+
+def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
+    """What the received frames say, as nested dicts (keys: docs/json.md).
+
+    Parameters
+    ----------
+    dashboard
+        Received frames, and the names of the wheels.
+    t
+        Time [s] of the newest frame; None before the first.
+    """
+    received, wheels = dashboard.known, dashboard.wheels()
+    number, value = received.number, received.value
+    verdict, kind = value("Traversability", "State"), value("SoilClass", "Kind")
+    record: dict[str, Any] = {
+        "t": t,
+        "window": _whole(number("WindowQuality", "Window")),
+        "status": value("SoilStrength", "Status"),
+        "state": value("SoilbusStatus", "State"),
+        "reason": value("SoilbusStatus", "Reason"),
+        "soil": {
+            name: _value_std(received, message, "Value", unit, "Std")
+            for name, (message, unit) in PARAMETER_FRAMES.items()
+        },
+        "bearing_pressure": _value_std(received, "SoilStrength", "BearingPressure", 1e3),
+        "soil_class": None
+        if kind is None
+        else {str(kind): number("SoilClass", "Probability"), "unknown": number("SoilClass", "UnknownProbability")},
+        "slip": {dashboard.vehicle.name(i): dashboard.wheel_slip(i) for i in wheels},
+        "sinkage": {dashboard.vehicle.name(i): _times(dashboard.wheel_sinkage(i), 1e-3) for i in wheels},
+        "traversability": {
+            "state": verdict if verdict in ("go", "caution", "no_go") else "unknown",
+            "probability": number("Traversability", "Probability"),
+            "torque_required": number("TorqueDemand", "TorqueRequired"),
+            "torque_available": number("TorqueDemand", "TorqueAvailable"),
+            "max_draft": _value_std(received, "DraftCapability", "MaxDraft"),
+            "max_grade": _value_std(received, "GradeCapability", "MaxGrade"),
+            "limit": value("Traversability", "LimitingCause"),
+            "age": number("Traversability", "Age"),
+            "since_valid": number("Traversability", "SinceValid"),
+        },
+        "capability": {
+            "max_draft_here": _value_std(received, "TractionLimits", "MaxDraft"),
+            "max_grade_with_draft": _value_std(received, "TractionLimits", "MaxGrade"),
+            "set_points": {
+                axle.lower(): {
+                    "efficiency": {"value": number("TractionAdvice", f"SlipForEfficiency{axle}"), "std": None},
+                    "pull": {"value": number("TractionAdvice", f"SlipForPull{axle}"), "std": None},
+                }
+                for axle in ("Front", "Rear")
+            },
+            "forecast": {"slip": _value_std(received, "DemandForecast", "Slip")},
+        },
+        "warning": {
+            "state": value("DemandForecast", "Warning") or "unknown",
+            "time_left": number("DemandForecast", "TimeLeft"),
+        },
+        "demand": {"draft": number("PresentDemand", "Draft"), "slope": number("PresentDemand", "Slope")},
+        "chi2": number("SoilStrength", "Chi2"),
+        "bus": {key: _whole(number("BusHealth", signal)) for key, signal in COUNTS.items()},
+        "bad_frames": received.bad_frames,
+        "fault": dashboard.fault or None,
+        "text": ". ".join(dashboard.sentences()) + ".",
+    }
+    known_only: dict[str, Any] = known(record)
+    return known_only
+
+
+def gist(record: dict[str, Any]) -> tuple[Any, ...]:
+    """The window and the states of a record; where they change there is something to say."""
+    of_window = (record[key] for key in ("window", "status", "state", "reason", "fault"))
+    return (*of_window, record["traversability"]["state"], record["warning"]["state"])
+
+
+def _value_std(
+    received: ReceivedFrames, message: str, value: str, unit: float = 1.0, std: str = ""
+) -> dict[str, float | None]:
+    """A value and its standard deviation, each times the SI value of one unit of the DBC."""
+    names = {"value": value, "std": std or f"{value}Std"}
+    return {key: _times(received.number(message, name), unit) for key, name in names.items()}
+
+
+def _whole(value: float | None) -> int | None:
+    return None if value is None else round(value)
+
+
+def _times(value: float | None, unit: float) -> float | None:
+    return None if value is None else value * unit
