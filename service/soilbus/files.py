@@ -1,18 +1,52 @@
 """Bounded reading of files that a user names, and outputs that are there whole or not at all.
 
-What is read may be a device without end, a pipe, a folder; what is written stays whole even when its process is killed.
+    file -> opened() -> plain bytes of a packed file -> text_lines()      streams: only ratios and lines are bounded
+                     -> read_unpacked()                                   what must be in memory as a whole
+
+What is read may be a device without end, a pipe, a folder, or made to fill the memory; what is written stays whole even
+when its process is killed.
 """
 
 from __future__ import annotations
 
+import bz2
+import codecs
 import errno
+import gzip
+import io
+import lzma
 import os
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a file may ask of the machine that reads it; the size of a log is not bounded, for it is never in memory."""
+
+    ratio: float = 250.0
+    """Unpacked bytes for each packed byte.  A candump log of a parked machine with constant data, 400 000 lines:
+    gzip 20, bzip2 51, zstd 107, xz 194; a deflate bomb has 1030, the others more."""
+    free: int = 16 * 2**20
+    """Unpacked bytes that any file may have, whatever its ratio: read in a second."""
+    line: int = 1 << 16
+    """Characters of a line: a frame of CAN FD takes 200, a comment in a log seldom a thousand."""
+    block: int = 64 * 2**20
+    """Bytes of a block that its format unpacks at once.  BLF and MF4 writers use 128 KiB to 4 MiB."""
+    dictionary: int = 192 * 2**20
+    """Bytes that a decoder of xz may need; `xz -9` asks for 65 MiB.  That of zstd takes 128 MiB by itself."""
+    whole: int = 128 * 2**20
+    """Unpacked bytes of a file that must be in memory as a whole: a table of 10 million cells, 1 GB as objects."""
+
+
+LIMITS = Limits()
 
 
 def read_bounded(path: Path, largest: int, regular: bool = True) -> bytes:
@@ -24,10 +58,160 @@ def read_bounded(path: Path, largest: int, regular: bool = True) -> bytes:
     with open(descriptor, "rb") as file:
         if regular and not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(errno.EINVAL, "not a regular file", str(path))
-        content = file.read(largest + 1)
+        return read_all(file, largest, str(path))
+
+
+def read_all(file: IO[bytes], largest: int = LIMITS.whole, name: str = "") -> bytes:
+    """The rest of a file; OSError where it has more than `largest` bytes."""
+    content = file.read(largest + 1)
     if len(content) > largest:
-        raise OSError(errno.EFBIG, f"larger than {largest / 2**20:g} MiB", str(path))
+        raise OSError(errno.EFBIG, f"larger than {largest / 2**20:g} MiB", name)
     return content
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[io.BufferedReader]:
+    """The plain bytes of a file, packed or not, as a stream; "-" is standard input.
+
+    Packing (gzip, bzip2, xz, zstd) is recognised by its first bytes.  Raises OSError where the file cannot be read;
+    reading raises ValueError where it is damaged, cut off, or more than its limits allow.
+    """
+    is_stdin = str(path) == "-"
+    with (
+        open(sys.stdin.fileno() if is_stdin else path, "rb", buffering=0, closefd=not is_stdin) as file,
+        plain_bytes(file) as stream,
+    ):
+        yield stream
+
+
+def plain_bytes(file: Any) -> io.BufferedReader:
+    """A stream of the plain bytes of an unbuffered binary file, which may be packed; as `opened`."""
+    packed = _Counted(file)
+    return io.BufferedReader(_Unpacked(packed), _BUFFER)
+
+
+def packing(stream: io.BufferedReader) -> str:
+    """How the file of a stream of `opened` is packed, such as "gzip"; empty where it is not."""
+    return stream.raw.packing if isinstance(stream.raw, _Unpacked) else ""
+
+
+def text_lines(stream: io.BufferedReader) -> Iterator[str]:
+    """The lines of a text file, none of which takes more memory than `Limits.line`; ValueError for a longer one.
+
+    UTF-8, or UTF-16 with its byte order mark; other bytes are of Windows' code page, as programs there write them.
+    """
+    is_wide = stream.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    text = io.TextIOWrapper(stream, "utf-16" if is_wide else "utf-8-sig", errors="cp1252")
+    for line in iter(partial(text.readline, LIMITS.line), ""):
+        if len(line) == LIMITS.line and line[-1] != "\n":
+            raise ValueError(f"a line of more than {LIMITS.line} characters")
+        yield line
+
+
+def _of_code_page(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeDecodeError) or error.encoding.startswith("utf-16"):
+        raise error
+    return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
+
+
+codecs.register_error("cp1252", _of_code_page)
+
+
+def within_ratio(packed: float, plain: float) -> None:
+    """Raise ValueError where packed bytes stand for more plain ones than `Limits.ratio` allows."""
+    if plain > LIMITS.free + LIMITS.ratio * packed:
+        raise ValueError(f"it unpacks to more than {LIMITS.ratio:g} times its size")
+
+
+_BUFFER = 1 << 16
+_PIECE = 1 << 12  # of a damaged file no more good bytes are lost
+
+
+class _Counted(io.RawIOBase):
+    """An unbuffered file, from its present place on, that counts the bytes read; its first ones can be looked at."""
+
+    def __init__(self, file: Any) -> None:
+        self._file, self.count, self.head = file, 0, b""
+        while len(self.head) < 6 and (more := file.read(_BUFFER)):
+            self.head += more
+        self._left = self.head
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._left[: len(buffer)] or self._file.read(len(buffer)) or b""
+        self._left = self._left[len(data) :]
+        buffer[: len(data)] = data
+        self.count += len(data)
+        return len(data)
+
+
+class _Unpacked(io.RawIOBase):
+    """Plain bytes of a packed file; ValueError where it is damaged or has more of them than its size allows."""
+
+    def __init__(self, packed: _Counted) -> None:
+        self._packed, self.count = packed, 0
+        kinds = [kind for kind, mark in _MARKS.items() if packed.head.startswith(mark)]
+        self.packing = kinds[0] if kinds else ""
+        self._read: Callable[[int], bytes] = packed.read
+        if self.packing == "gzip":
+            self._read = gzip.GzipFile(fileobj=packed).read1
+        elif self.packing == "zstd":
+            try:
+                plain = import_module("pyarrow").input_stream(packed, compression="zstd")
+            except ModuleNotFoundError:
+                raise OSError(errno.ENOSYS, "a file packed by zstd needs the extra soilbus[tables]") from None
+            self._read = lambda size: plain.read(min(size, _PIECE))
+        elif self.packing:
+            self._read = _decoded(packed, self.packing)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            plain = self._read(len(buffer))
+        except MemoryError:
+            raise
+        except Exception as error:  # each decoder has its own
+            if isinstance(error, OSError) and error.errno is not None:
+                raise
+            raise ValueError(f"{self.packing} data: {' '.join(str(error).split())}") from None
+        buffer[: len(plain)] = plain
+        self.count += len(plain)
+        if self.packing:
+            within_ratio(self._packed.count, self.count)
+        return len(plain)
+
+
+_MARKS = {"gzip": b"\x1f\x8b", "bzip2": b"BZh", "xz": b"\xfd7zXZ\0", "zstd": b"\x28\xb5\x2f\xfd"}
+
+
+def _decoded(packed: _Counted, kind: str) -> Callable[[int], bytes]:
+    """A function that reads plain bytes of bzip2 or xz, of one stream or several, with a decoder of bounded memory."""
+
+    def new() -> Any:
+        return lzma.LZMADecompressor(memlimit=LIMITS.dictionary) if kind == "xz" else bz2.BZ2Decompressor()
+
+    decoder = new()
+
+    def read(size: int) -> bytes:
+        nonlocal decoder
+        plain = b""
+        while not plain:
+            more = b""
+            if decoder.eof:
+                more = (decoder.unused_data or packed.read(_BUFFER)).lstrip(b"\0")
+                if not more:
+                    return b""
+                decoder = new()
+            elif decoder.needs_input and not (more := packed.read(_BUFFER)):
+                raise EOFError("cut off")
+            plain = decoder.decompress(more, size)
+        return plain
+
+    return read
 
 
 _NO_UNNAMED_FILES = {errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL}

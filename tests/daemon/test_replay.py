@@ -186,7 +186,9 @@ def test_a_reader_that_cannot_be_made_prints_nothing_when_it_is_destroyed(tmp_pa
 
     said: list[object] = []
     monkeypatch.setattr("sys.unraisablehook", said.append)
-    monkeypatch.setattr("can.LogReader", HalfMade)
+    monkeypatch.setattr("can.MF4Reader", HalfMade)
+    monkeypatch.setattr("can.io.mf4.asammdf", object())
+    (tmp_path / "drive.mf4").write_bytes(b"MDF     4.10")
     with pytest.raises(LogError, match="no MDF file"):
         list(read_log(tmp_path / "drive.mf4"))
     gc.collect()

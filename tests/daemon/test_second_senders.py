@@ -18,7 +18,7 @@ from soilbus.cli.main import main
 from soilbus.daemon.notify import Notifier
 from soilbus.sensors.survey import survey
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import Bench, drive_messages
+from tests.lab.fakes import Bench, drive_messages
 
 CONFIG, DURATION = reference_configuration(), 16.0
 MOTOR = load_databases(CONFIG).get_message_by_name("MotorFL").frame_id

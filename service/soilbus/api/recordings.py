@@ -41,7 +41,7 @@ def replay(log: PathLike | Sequence[PathLike], config: Config | PathLike) -> Any
     Parameters
     ----------
     log
-        File or files: every format that python-can reads, MF4, or CSV and Parquet where the configuration has [table].
+        File or files: every log that `soilbus replay` reads, or CSV and Parquet where the configuration has [table].
     config
         Configuration, or the path of one.
 

@@ -64,6 +64,8 @@ class Counts:
     unknown: int = 0
     unknown_ids: Counter[int] = field(default_factory=Counter)
     error_frames: int = 0
+    elsewhere: int = 0
+    """Frames of other channels of a log."""
     clock_steps: int = 0
     senders: dict[str, set[int]] = field(default_factory=dict)
     """Source addresses of a message by its name, where several sent it and none of them is the DBC's."""

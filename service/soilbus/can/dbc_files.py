@@ -12,7 +12,7 @@ from typing import Any
 from cantools.database.can import Database, Message
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
-from soilbus.can.dbc_text import message_names, of_messages
+from soilbus.can.dbc_text import check_multiplexers, message_names, of_messages
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
@@ -170,6 +170,7 @@ def _read(path: Path, names: set[str] | None = None) -> Database:
     except UnicodeDecodeError:
         text = raw.decode("cp1252", errors="replace")
     has_some = False
+    check_multiplexers(text)
     if names is not None:
         has_some = bool(message_names(text))
         text = of_messages(text, names, lambda identifier: pgn_of(identifier) in STANDARD_PGNS)

@@ -1,4 +1,4 @@
-"""A DBC's text without the messages that nobody asks for.
+"""A DBC's text without the messages that nobody asks for, checked for ranges that no memory can hold.
 
 cantools makes some 30 kB of each message, and needs 2 ms for it; a manufacturer's DBC may have
 thousands of messages, of which a tractor maps a dozen.  What is not plainly the definition of a
@@ -21,6 +21,27 @@ _ABOUT = re.compile(
     r"""[ \t]+(?P<id>\d+)\b[^"\n]*(?:"[^"\n]*"[^"\n]*)*;[ \t\r]*\n""",
     re.MULTILINE,
 )
+
+
+MOST_MULTIPLEXER_VALUES = 1 << 18
+"""Values of all ranges of a DBC: 1024 signals in each of 256 pages.  cantools makes 0.3 kB of each."""
+MOST_DIGITS = 12
+"""Digits of a number in a range: a multiplexer of 32 bits has 10."""
+_RANGES = re.compile(r"\bSG_MUL_VAL_\s+\d+\s+(?P<signal>\w+)\s+\w+(?P<ranges>[^;]*)")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+
+
+def check_multiplexers(text: str) -> None:
+    """Raise ValueError where the ranges of SG_MUL_VAL_ have more values than can be expanded, which the parser does."""
+    left = MOST_MULTIPLEXER_VALUES
+    for found in _RANGES.finditer(text):
+        for low, high in _RANGE.findall(found["ranges"]):
+            left -= max(int(high) - int(low) + 1, 0) if len(high) < MOST_DIGITS else left + 1
+            if left < 0:
+                raise ValueError(
+                    f"SG_MUL_VAL_ of {found['signal']}: with {low}-{high} the multiplexers have more than"
+                    f" {MOST_MULTIPLEXER_VALUES} values"
+                )
 
 
 def message_names(text: str) -> set[str]:

@@ -124,6 +124,11 @@ def command_line() -> argparse.ArgumentParser:
             )
         return sub
 
+    def channel(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument(
+            "--channel", metavar="NAME", help="of logs with several, as they name it: can1, 2 (default: bus.channel)"
+        )
+
     def figures(sub: argparse.ArgumentParser, seed_of: str = "") -> None:
         if seed_of:
             sub.add_argument("--seed", type=natural, default=1, help=f"of {seed_of} (default 1)")
@@ -143,6 +148,7 @@ def command_line() -> argparse.ArgumentParser:
         "--dbc", action="append", type=Path, required=True, metavar="FILE", help="of the vehicle; repeat it for more"
     )
     sub.add_argument("--log", type=Path, metavar="LOG", help="a drive with varied load, to see what each signal does")
+    channel(sub)
     sub.add_argument(
         "-o", "--out", type=Path, default=Path("-"), metavar="OUT.toml", help="file to write (default: stdout)"
     )
@@ -153,13 +159,15 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("check", "check configuration and DBCs, list every mapped signal")
     heard = sub.add_mutually_exclusive_group()
-    heard.add_argument("--log", type=Path, metavar="LOG", help="and compare them with a recording")
+    heard.add_argument("--log", type=Path, metavar="LOG", help="and compare them with a recording (- for stdin)")
     heard.add_argument(
         "--live", type=between(1.0, 3600.0), metavar="SECONDS", help="and with SECONDS of the configured bus"
     )
+    channel(sub)
 
     sub = command("replay", "the service's own pipeline over recorded logs")
-    sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
+    sub.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recording; - for stdin")
+    channel(sub)
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
@@ -230,6 +238,7 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("diagnose", "what the model misses: find, name, add, show")
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one vehicle")
+    channel(sub)
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the findings as JSON; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
@@ -245,6 +254,7 @@ def command_line() -> argparse.ArgumentParser:
         help="log, folder, glob, URL, or manifest: a CSV or Parquet file with log, vehicle, configuration, start",
     )  # fmt: skip
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    channel(sub)
     sub.add_argument(
         "--scheduler",
         metavar="ADDRESS",

@@ -24,7 +24,8 @@ def configured(args: argparse.Namespace) -> Config:
     """The configuration that --config and --set name, or soilbus.toml in the current folder."""
     from soilbus.config.file import found_configuration, load_config
 
-    return load_config(found_configuration(args.config), args.set)
+    config = load_config(found_configuration(args.config), args.set)
+    return config.model_copy(update={"log_channel": getattr(args, "channel", None)})
 
 
 def configured_or_reference(args: argparse.Namespace) -> Config:

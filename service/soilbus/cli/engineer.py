@@ -37,13 +37,15 @@ def replay(args: argparse.Namespace) -> None:
     with loading():
         from soilbus.can.dbc_files import load_databases
         from soilbus.config.model import ConfigError
-        from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
+        from soilbus.offline.replay import LogError, channel_notes, estimator_beside, replay
         from soilbus.pipeline.pipeline import Pipeline
         from soilbus.report.progress import progress
         from soilbus.report.windows import summary
 
     config = configured(args)
     _check_files(args, config)
+    if args.frames is not None and "-" in map(str, args.logs):
+        raise ConfigError(["--frames reads each log again, which standard input cannot be"])
     if config.table is not None:
         if args.frames is not None:
             raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
@@ -51,7 +53,7 @@ def replay(args: argparse.Namespace) -> None:
             raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
         _replay_tables(args, config)
         return
-    for line in other_channel(config, args.logs):
+    for line in channel_notes(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
     results: list[WindowResult] = []
@@ -316,7 +318,7 @@ def diagnose(args: argparse.Namespace) -> None:
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
-    from soilbus.offline.replay import LogError, other_channel
+    from soilbus.offline.replay import LogError, channel_notes
     from soilbus.report.findings import findings_json, findings_text
     from soilbus.report.progress import phases
 
@@ -327,7 +329,7 @@ def diagnose(args: argparse.Namespace) -> None:
         _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
     check_outputs(args.json, args.report, args.model_out, args.manoeuvre_out, read=_read_files(args, config))
-    for line in other_channel(config, args.logs) if config.table is None else []:
+    for line in channel_notes(config, args.logs) if config.table is None else []:
         say(line)
     try:
         with phases("diagnose") as phase:
@@ -358,7 +360,7 @@ def batch(args: argparse.Namespace) -> None:
     from soilbus.config.file import found_configuration, load_config
 
     def own(path: Path) -> Config:
-        return load_config(found_configuration(str(path)), args.set)
+        return load_config(found_configuration(str(path)), args.set).model_copy(update={"log_channel": args.channel})
 
     config = configured(args)
     for module in ("distributed", "pyarrow"):

@@ -136,9 +136,15 @@ def commands_page() -> str:
         " or configuration. `--set KEY=VALUE` (dotted path, as in `--set soil.c.value=5000` or"
         " `--set wheel.FL.radius=0.51`) overrides a value of the configuration in any command that takes `--config`."
         " Without `--config` it is `soilbus.toml` in the current folder; `tractor`, `tractor-2wd` and `tractor-axles`"
-        " name reference machines. An output file is there whole or not at all; workers end with the command. Logs may"
-        " be in any format that python-can reads; MF4 needs the extra `mf4`, `--report` the extra `plots`, `bench` the"
-        " extra `peers`, `completion` the extra of its name.\n"
+        " name reference machines. An output file is there whole or not at all; workers end with the command. \n\nLogs"
+        " are told by their content, whatever their name: candump (`-L`, or its console output with stamps), SavvyCAN"
+        " (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite of python-can;"
+        " plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as UTC. Of a log with"
+        " several channels `bus.channel` is read, or `--channel`; the others are counted and said. `canN` is also the"
+        " channel numbered N + 1, or N in a log whose numbers begin at 0; a log of one other channel is read, with a"
+        " line that says so.\n\n"
+        "MF4 needs the extra `mf4`, zstd `tables`, `--report` `plots`, `bench` `peers`, `completion` the extra of its"
+        " name.\n"
     )
     for name, command in subcommands(command_line()).items():
         text += f"\n## soilbus {name}\n\n{command.description}\n\n{_arguments(command)}"

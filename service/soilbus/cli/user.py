@@ -22,6 +22,7 @@ from soilbus.process import ENDING, say
 
 if TYPE_CHECKING:
     from soilbus.can.candump import Frame
+    from soilbus.can.logs import Log
     from soilbus.config.model import Config
     from soilbus.sensors.survey import Survey
 
@@ -37,11 +38,11 @@ def demo(args: argparse.Namespace) -> None:
 def init(args: argparse.Namespace) -> None:
     """`soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
     from soilbus.can.dbc_files import load_databases
+    from soilbus.can.logs import Log, LogError
     from soilbus.can.role_matching import assigned, candidates
     from soilbus.config.edit import named_from
     from soilbus.config.file import located, parse_config
     from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError, read_frames
     from soilbus.report.progress import progress
     from soilbus.report.proposal import proposal
     from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
@@ -58,20 +59,23 @@ def init(args: argparse.Namespace) -> None:
     found, facts = candidates(database), Facts()
     if args.log is not None:
         try:
+            log = Log(args.log, args.channel or "", demanded=True)
             with progress("init") as step:
-                recording = recording_of(found, database, _counted(read_frames(args.log), step))
+                recording = recording_of(found, database, _counted(log.frames(), step))
         except LogError as error:
             raise WorkError(str(error)) from None
+        if log.note:
+            say(log.note)
         if not recording.columns:
             raise WorkError(f"{args.log}: no frame of a signal in {', '.join(map(str, args.dbc))} that could be mapped")
         found = weighed(found, recording)
         facts = facts_of(assigned(found), recording)
     files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
-    log = [] if args.log is None else ["--log", str(args.log)]
-    words = ["soilbus", "init", *(word for path in args.dbc for word in ("--dbc", str(path))), *log]
+    with_log = [] if args.log is None else ["--log", str(args.log)]
+    words = ["soilbus", "init", *(word for path in args.dbc for word in ("--dbc", str(path))), *with_log]
     made = proposal(database, assigned(found), facts, files, shlex.join(words))
     write_text(args.out, made.text)
-    then = shlex.join(["soilbus", "check", "--config", "soilbus.toml" if to_stdout else str(args.out), *log])
+    then = shlex.join(["soilbus", "check", "--config", "soilbus.toml" if to_stdout else str(args.out), *with_log])
     say(f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then {then}')
 
 
@@ -101,15 +105,18 @@ def run(args: argparse.Namespace) -> None:
 def check(args: argparse.Namespace) -> None:
     """`soilbus check`: the configuration, and with a recording or a live bus the data beside it."""
     from soilbus.config.model import ConfigError
-    from soilbus.report.configuration import configuration_report, configuration_warnings, survey_report
+    from soilbus.report.configuration import configuration_report, configuration_warnings, log_report, survey_report
 
     config = configured(args)
     print(configuration_report(config), end="")
     warnings, faults = configuration_warnings(config), list[str]()
     if args.log is not None or args.live is not None:
-        found, of_channel = _surveyed(args, config)
+        found, log = _surveyed(args, config)
+        if log is not None:
+            print(log_report(log, found), end="")
+            warnings += [log.note] * bool(log.note)
         print(survey_report(found), end="")
-        warnings += [*of_channel, *found.warnings]
+        warnings += found.warnings
         faults = found.faults
     for line in warnings:
         say(f"warning: {line}")
@@ -117,12 +124,12 @@ def check(args: argparse.Namespace) -> None:
         raise ConfigError(faults)
 
 
-def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, list[str]]:
-    """What a recording, or the bus, says of the configuration, and whether it is of the configured channel."""
+def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | None]:
+    """What a recording, or the bus, says of the configuration, and the recording as far as it was read."""
     from soilbus.can.bus import BusError, heard_for
     from soilbus.can.dbc_files import load_databases
     from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError, other_channel, read_frames
+    from soilbus.offline.replay import LogError, log_of
     from soilbus.report.progress import progress
     from soilbus.sensors.survey import survey
 
@@ -131,9 +138,10 @@ def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, list[st
     database = load_databases(config)
     try:
         if args.live is not None:
-            return survey(config, database, heard_for(config.bus.model_dump(), args.live)), []
+            return survey(config, database, heard_for(config.bus.model_dump(), args.live)), None
+        log = log_of(config, args.log)
         with progress("check") as step:
-            return survey(config, database, _counted(read_frames(args.log), step)), other_channel(config, [args.log])
+            return survey(config, database, _counted(log.frames(), step)), log
     except (LogError, BusError) as error:
         raise WorkError(str(error)) from None
 

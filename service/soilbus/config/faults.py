@@ -193,7 +193,7 @@ def _named(raw: Any, location: Sequence[Any]) -> list[str]:
 def _keys(location: Sequence[Any]) -> list[str]:
     """The keys that the table at this location may have."""
     model = _model_at(location)
-    return [] if model is None else [key for key in model.model_fields if key != "folder"]
+    return [] if model is None else [key for key in model.model_fields if not model.model_fields[key].exclude]
 
 
 def _choices(location: Sequence[Any]) -> list[Any]:

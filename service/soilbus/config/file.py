@@ -103,8 +103,9 @@ def found_configuration(name: str | None) -> Path:
 
 def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
     """Check a configuration given as nested mappings; ConfigError lists every fault."""
-    if "folder" in raw:
-        raise ConfigError([f"{source}: folder: unknown key"])
+    for key, field in Config.model_fields.items():
+        if field.exclude and key in raw:
+            raise ConfigError([f"{source}: {key}: unknown key"])
     if left := open_lines(raw):
         raise ConfigError(f"{source}: {line}" for line in left)
     try:

@@ -899,6 +899,8 @@ class Config(_Section):
     output: Output = Output()
     j1939: J1939 = J1939()
     folder: Path = Field(default=Path("."), exclude=True)
+    log_channel: str | None = Field(default=None, exclude=True)
+    """The channel that --channel demands of logs; None: bus.channel, where a log has it."""
 
     @model_validator(mode="before")
     @classmethod

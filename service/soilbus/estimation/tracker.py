@@ -350,15 +350,12 @@ class Tracker:
         known = other.newest_posterior
         if known is None:
             return
-        gains = self._initial_gain_std()
+        gains = gain_errors(self.rig, self.model, self.free)[1]
         covariance = np.zeros((_SOIL + len(gains),) * 2)
         covariance[:_SOIL, :_SOIL] = known.covariance[:_SOIL, :_SOIL]
         covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] = gains**2
-        self._posteriors = [(t, Gaussian(known.soil, np.zeros(len(gains)), covariance))]
-        self._components = other._components
-
-    def _initial_gain_std(self) -> Array:
-        return gain_errors(self.rig, self.model, self.free)[1]
+        self._posteriors.append((t, Gaussian(known.soil, np.zeros(len(gains)), covariance)))
+        self._components = other.components
 
     def reset(self) -> None:
         """Forget all windows."""
@@ -369,6 +366,11 @@ class Tracker:
         self._posteriors: list[tuple[float, Gaussian]] = []
         self._newest_posterior: Gaussian | None = None
         self._components = VarianceComponents(self.rig.options.variance)
+
+    @property
+    def components(self) -> VarianceComponents:
+        """What each kind of sensor is worth, by the windows so far."""
+        return self._components
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         """Estimate one window; windows come in their order.

@@ -32,6 +32,7 @@ from typing import Any
 
 from soilbus import __version__
 from soilbus.config.model import ConfigError
+from soilbus.files import LIMITS, read_bounded
 from soilbus.grouping import grouped
 from soilbus.offline import dataset
 from soilbus.offline.fleet import (
@@ -429,7 +430,7 @@ def _all_kept(jobs: Sequence[Job], parts: Path) -> dict[str, Kept]:
 def _kept(parts: Path, job: Job) -> Kept | None:
     """What came of a log before; None where there is nothing, its part is lost, or its file is another one."""
     try:
-        kept = Kept(**json.loads(_kept_path(parts, job.digest).read_bytes()))
+        kept = Kept(**json.loads(read_bounded(_kept_path(parts, job.digest), LIMITS.whole)))
     except (OSError, ValueError, TypeError):
         return None
     if kept.windows and summary_of_part(_part_path(parts, job.digest)) is None:
@@ -635,14 +636,14 @@ def _diagnosed(
         dataset.put(kept[left[digest]], [json.dumps(known(findings), indent=1, allow_nan=False).encode()])
         beside = f" beside {', '.join(given[0])}" if given[0] else ""
         progress(f"{n} of {len(left)} vehicles diagnosed{beside}")
-    return [json.loads(path.read_bytes()) for path in kept]
+    return [json.loads(read_bounded(path, LIMITS.whole)) for path in kept]
 
 
 def _are_kept(path: Path, retry: bool) -> bool:
     """Whether a vehicle's findings are there; with `retry` those that lack a log are not."""
     if not path.exists():
         return False
-    findings = json.loads(path.read_bytes()) if retry else {}
+    findings = json.loads(read_bounded(path, LIMITS.whole)) if retry else {}
     return not (findings.get("fault") or findings.get("left_out"))
 
 

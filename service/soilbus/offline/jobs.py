@@ -9,29 +9,31 @@ import csv
 import glob
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from functools import partial
-from io import BytesIO, TextIOWrapper
+from io import BytesIO
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any, BinaryIO
 
+from soilbus.can.log_formats import is_csv_of_frames
 from soilbus.config.model import Config
+from soilbus.files import opened, plain_bytes, read_all, text_lines
 from soilbus.offline import dataset
 from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
-from soilbus.offline.tables import MISSING_CELLS, separator_of
+from soilbus.offline.tables import MISSING_CELLS, check_cells, separator_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
 LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
-"""Of logs that python-can reads; each may have .gz behind it."""
+"""Of logs in a folder; what a log is, its content tells."""
+PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zst")
+"""Each may stand behind one of a log."""
 TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
-CAN_CSV_COLUMNS = 7
-"""Of a log in the CSV of python-can."""
 
 
 class BatchError(Exception):
@@ -133,7 +135,7 @@ def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
             return [{"log": argument}]
         raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
     if "log" not in header:
-        if tables or len(header) in (0, CAN_CSV_COLUMNS):
+        if tables or not header or is_csv_of_frames(",".join(header)):
             return [{"log": argument}]
         raise BatchError(f"{argument}: a manifest needs a column log; its columns are {', '.join(header) or 'none'}")
     if not rows:
@@ -141,14 +143,17 @@ def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
     return [_entry(argument, number, row) for number, row in rows]
 
 
-def _opened(argument: str) -> AbstractContextManager[IO[bytes]]:
-    """The file at a path or URL, to read."""
+@contextmanager
+def _opened(argument: str) -> Iterator[BinaryIO]:
+    """The plain bytes of the file at a path or URL."""
     if "://" not in argument:
-        return Path(argument).open("rb")
+        with opened(Path(argument)) as stream:
+            yield stream
+        return
     import fsspec
 
-    opened: AbstractContextManager[IO[bytes]] = fsspec.open(argument, "rb")
-    return opened
+    with fsspec.open(argument, "rb") as file:
+        yield plain_bytes(file)
 
 
 def _entry(manifest: str, number: int, row: Mapping[str, Any]) -> dict[str, str]:
@@ -184,29 +189,28 @@ def _is_machine(configuration: Path) -> bool:
     return not configuration.suffix and not configuration.exists()
 
 
-def _csv_rows(file: IO[bytes]) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+def _csv_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
     """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
-    with TextIOWrapper(file, newline="", encoding="utf-8-sig") as text:
-        first = text.readline()
-        table = csv.reader(chain([first], text), delimiter=separator_of(first.lower(), MANIFEST_COLUMNS), strict=True)
-        header = [name.strip().lower() for name in next(table, [])]
-        if "log" not in header:
-            return header, []
-        return header, [
-            (table.line_num, dict(zip(header, row, strict=False))) for row in table if any(map(str.strip, row))
-        ]
+    text = text_lines(plain_bytes(BytesIO(read_all(file))))
+    first = next(text, "")
+    table = csv.reader(chain([first], text), delimiter=separator_of(first.lower(), MANIFEST_COLUMNS), strict=True)
+    header = [name.strip().lower() for name in next(table, [])]
+    if "log" not in header:
+        return header, []
+    return header, [(table.line_num, dict(zip(header, row, strict=False))) for row in table if any(map(str.strip, row))]
 
 
-def _parquet_rows(file: IO[bytes]) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
+def _parquet_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
     """Names of columns, and the numbered rows of a manifest."""
     import pyarrow.parquet as pq
 
-    content = BytesIO(file.read()) if not file.seekable() else file
+    content = BytesIO(read_all(file))
     columns = pq.read_schema(content).names
     header = [name.strip().lower() for name in columns]
     if "log" not in header:
         return header, []
     wanted = [name for name, plain in zip(columns, header, strict=True) if plain in MANIFEST_COLUMNS]
+    check_cells(pq.read_metadata(content).num_rows * len(wanted))
     table = pq.read_table(content, columns=wanted)
     rows = table.rename_columns([name.strip().lower() for name in table.column_names]).to_pylist()
     return header, list(enumerate(rows, 1))
@@ -282,4 +286,5 @@ def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
 
 
 def _is_log(name: str, suffixes: Sequence[str]) -> bool:
-    return Path(name.lower().removesuffix(".gz")).suffix in suffixes
+    path = Path(name.lower())
+    return (path.with_suffix("") if path.suffix in PACKED_SUFFIXES else path).suffix in suffixes

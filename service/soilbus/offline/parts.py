@@ -38,6 +38,7 @@ from soilbus.config.file import located
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
+from soilbus.files import opened, plain_bytes, text_lines
 from soilbus.offline.replay import LogError, OtherBus, log_names, replay
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import flat_record, window_record
@@ -46,6 +47,11 @@ from soilbus.pipeline.result import WindowResult, is_date
 from soilbus.words import one_line
 
 MISSING = "no such file"
+CPU_FREE = 600.0
+"""Processor time [s] that any log may take."""
+CPU_PER_BYTE = 60.0 / 2**20
+"""Processor time [s] that it may take beside for each byte.  A candump log of a drive takes 0.3 s a MiB, packed by xz
+2 s; one of a few frames a second, packed, 60 s."""
 WINDOWS_OF_PIECE = 5_000
 """Windows of a log that are handed over at once; 1 kB each.  Of messages of 10 MB Dask warns; a log of an hour, with
 a window every second, is one piece."""
@@ -163,7 +169,7 @@ def setup_of(config: Config, name: str) -> Setup:
     ConfigError
         A DBC file is missing or does not fit the configuration.
     """
-    digest = hashlib.sha256(config.model_dump_json().encode())
+    digest = hashlib.sha256((config.model_dump_json() + (config.log_channel or "")).encode())
     database = None
     if config.table is None:
         with TemporaryDirectory(prefix="soilbus-") as folder:
@@ -254,7 +260,7 @@ def part_of(job: Job, version: str, of_piece: int = WINDOWS_OF_PIECE) -> Outcome
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
             with TemporaryFile() as lines:
-                outcome = _replayed(lines, job, path, of_piece)
+                outcome = _replayed(lines, job, path, of_piece, begin + CPU_FREE + CPU_PER_BYTE * size)
     except LogError as error:
         return Outcome(None, str(error))
     except MemoryError:
@@ -301,8 +307,11 @@ def local_log(job: Job) -> Iterator[Path]:
         yield path
 
 
-def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int) -> Outcome:
-    """The outcome; `lines` is an empty file that holds the pieces until the summary, which goes before, is known."""
+def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int, latest: float) -> Outcome:
+    """The outcome; `lines` is an empty file that holds the pieces until the summary, which goes before, is known.
+
+    When the thread's clock says `latest` [s] the log is given up.
+    """
     config, database = unpacked(job.setup.content)
     summary = _Summary(job, config)
     fault: LogError | None = None
@@ -315,6 +324,8 @@ def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int) -> Outcome:
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
                 run = (result.log or "").removeprefix(label) if pipeline is None else ""  # of a table: its soil bed
+                if time.thread_time() > latest:
+                    raise LogError(f"{path}: given up: it takes more processor time than a log of its size may")
                 row = summary.row(replace(result, log=job.log + run))
                 yield json.dumps(row, allow_nan=False).encode() + b"\n"
         except LogError as error:
@@ -423,6 +434,7 @@ class _Summary:
                 "frames.unknown": counts.unknown,
                 "frames.error": counts.error_frames,
                 "frames.lost": pipeline.admission.missed,
+                "frames.other_channel": counts.elsewhere,
             }
             used, rejected = refusals.used, refusals.total
         return {
@@ -446,8 +458,8 @@ class _Summary:
 def summary_of_part(path: Path) -> dict[str, Any] | None:
     """The summary in a part; None where there is no part."""
     try:
-        with gzip.open(path) as lines:
-            summary: dict[str, Any] = json.loads(next(lines))
+        with opened(path) as part:
+            summary: dict[str, Any] = json.loads(next(text_lines(part)))
         is_whole = path.stat().st_size > sum(summary["pieces"])
     except (OSError, EOFError, StopIteration, ValueError, KeyError):
         return None
@@ -471,6 +483,6 @@ def pieces_of_part(path: Path, sizes: Sequence[int]) -> Iterator[bytes]:
 
 def rows_of_piece(piece: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
     """The windows of a piece as rows of a table, `at_once` or fewer at a time."""
-    with gzip.GzipFile(fileobj=BytesIO(piece)) as lines:
-        while rows := [json.loads(line) for line in islice(lines, at_once)]:
-            yield rows
+    lines = text_lines(plain_bytes(BytesIO(piece)))
+    while rows := [json.loads(line) for line in islice(lines, at_once)]:
+        yield rows

@@ -8,135 +8,45 @@ overlap in two processes, and the results are the same as in one.
 
 from __future__ import annotations
 
-import gc
-import gzip
 import math
 import os
 import sys
-import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from io import TextIOBase
-from itertools import chain, islice
 from multiprocessing import get_all_start_methods
 from pathlib import Path
-from typing import Any, TypeVar
 
 import can
 
 from soilbus.can.admission import LONGEST_GAP, Admission
-from soilbus.can.candump import Frame, candump_batches, frame_of, whole
-from soilbus.can.log_lines import LogLines
+from soilbus.can.candump import Frame
+from soilbus.can.logs import Log, LogError, OtherBus, read_frames
 from soilbus.config.model import Config
 from soilbus.pipeline.estimator import Undecided, WindowEstimator
 from soilbus.pipeline.intake import Intake, WindowTask
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
-from soilbus.words import LONGEST_NAME, one_line, shown
+from soilbus.words import LONGEST_NAME, shown
 from soilbus.workers import workers
 
 __all__ = ["LogError", "OtherBus", "estimator_beside", "fed", "log_names", "read_frames", "read_log", "replay"]
 
-_T = TypeVar("_T")
-
 SWITCH_INTERVAL = 0.0002
 """Time [s] after which the interpreter switches threads, so that the pool's thread can hand on tasks."""
-CHANNEL_SCAN_LINES = 2000
-"""Lines of a log in which its channels are looked for: several seconds of a bus."""
 MAX_PENDING_WINDOWS = 30
 """Windows that may wait for the estimator."""
 
 
-class LogError(Exception):
-    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place.
-
-    `lasting` is False where the fault is of the machine that reads it, not of what is in the log.
-    """
-
-    windows = 0
-    lasting = True
-
-
-class OtherBus(LogError):
-    """No frame of a log is in the DBC: of another bus, or of another vehicle than the configuration's."""
-
-
-def read_log(path: Path) -> Iterator[can.Message]:
-    """Messages of one log, in any format that python-can reads (and MF4 with the extra `mf4`).
-
-    Raises
-    ------
-    LogError
-        The file is missing, of an unknown format, or damaged.
-    """
-    return chain.from_iterable(_read(path, lambda reader: ([whole(message)] for message in _timed(reader))))
-
-
-def read_frames(path: Path) -> Iterator[Frame]:
-    """The frames of read_log()'s messages, several times as fast for a candump log."""
-    return chain.from_iterable(_read(path, _frames))
-
-
-def _frames(reader: Any) -> Iterator[list[Frame]]:
-    if isinstance(reader, can.CanutilsLogReader):
-        return candump_batches(reader.file)
-    return ([frame_of(whole(message))] for message in _timed(reader))
-
-
-def _timed(reader: Any) -> Iterator[can.Message]:
-    """The messages of a reader; ValueError where an ASC log's stamps only say how long after the last event each came.
-
-    Events between them that are no frames do not come from the reader, so the times cannot be summed up.
-    """
-    last = -math.inf
-    for message in reader:
-        if message.timestamp < last and getattr(reader, "timestamps_format", None) == "relative":
-            raise ValueError("its stamps are relative to the event before: save it with absolute ones")
-        last = message.timestamp
-        yield message
-
-
-def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[list[_T]]:
-    """What `batches` makes of python-can's reader of a log; LogError as read_log()."""
-    n = 0
-    try:
-        with _reader(path) as reader:
-            if isinstance(getattr(reader, "file", None), TextIOBase):
-                reader.file = LogLines(reader.file)
-            for batch in batches(reader):
-                n += len(batch)
-                yield batch
-    except FileNotFoundError:
-        raise LogError(f"{path}: no such file") from None
-    except NotImplementedError:
-        fault = LogError(f"{path}: this format needs soilbus[mf4]")
-        fault.lasting = False
-        raise fault from None
-    except Exception as error:  # python-can's readers raise all kinds on a damaged file
-        what = "not a CAN log that can be read" if n == 0 else f"cut off or damaged after {n} frames"
-        why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 100)
-        raise LogError(f"{path}: {what} ({why})") from None
-    if n == 0:
-        raise LogError(f"{path}: no frame in it")
-
-
-def _reader(path: Path) -> Any:
-    """python-can's reader; it does not recognise a name such as a.b.log.gz, which is done here."""
-    if path.suffixes[-2:] == [".log", ".gz"]:
-        return can.CanutilsLogReader(gzip.open(path, "rt"))
-    usual = sys.unraisablehook
-    try:
-        return can.LogReader(path)
-    except Exception as error:
-        sys.unraisablehook = lambda _: None  # asammdf's destructor fails on what its constructor has left unmade
-        traceback.clear_frames(error.__traceback__)
-        gc.collect()
-        raise
-    finally:
-        sys.unraisablehook = usual
+def read_log(path: Path, channel: str = "") -> Iterator[can.Message]:
+    """The frames of read_frames() as messages of python-can."""
+    for t, identifier, extended, data, remote, error in read_frames(path, channel):
+        yield can.Message(
+            timestamp=t, arbitration_id=identifier, is_extended_id=extended, data=data, is_remote_frame=remote,
+            is_error_frame=error, is_fd=len(data) > 8,
+        )  # fmt: skip
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:
@@ -266,7 +176,7 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
     Raises
     ------
     LogError
-        As read_log(); where the last frame is not whole; where no frame is of a mapped message.
+        As `Log.frames`; where the last frame is not whole; where no frame is of a mapped message.
     """
     admission, counts = intake.admission, intake.admission.counts
     feed = admission.feed
@@ -274,7 +184,8 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
     first = due = math.nan
     n = 0
     frame: Frame = (math.nan, 0, False, b"", False, True)
-    for n, frame in enumerate(read_frames(log), 1):
+    recording = log_of(intake.config, log)
+    for n, frame in enumerate(recording.frames(), 1):
         t, identifier, extended, data, remote, error = frame
         if error:
             counts.error_frames += 1
@@ -286,6 +197,7 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
             if progress is not None:
                 first = t if math.isnan(first) else first
                 progress(n, t - first)
+    counts.elsewhere += recording.left_out
     t, identifier, extended, data, remote, error = frame
     yield _plausible_time(admission, t)
     if counts.unknown + counts.error_frames == unheard + n:
@@ -335,27 +247,18 @@ def _estimate(task: WindowTask) -> Undecided:
     return _estimator.estimate(task)
 
 
-def other_channel(config: Config, logs: Iterable[Path]) -> list[str]:
-    """A line for each log whose first frames are of several channels, or a candump log's of another than configured."""
-    lines = []
+def channel_notes(config: Config, logs: Iterable[Path]) -> list[str]:
+    """A line for each log whose first frames are not all of the configured channel; none for what cannot be read."""
+    notes = []
     for path in logs:
-        names = _channels(path)
-        if names and names != {config.bus.channel}:
-            of = " and ".join(sorted(names))
-            lines.append(f"{path}: frames of {of}, where bus.channel = {config.bus.channel}; all of them count")
-    return lines
+        if str(path) != "-":
+            log = log_of(config, path)
+            with suppress(LogError):
+                next(log.frames())
+            notes.append(log.note)
+    return [note for note in notes if note]
 
 
-def _channels(path: Path) -> set[str]:
-    """Channels of the first frames of a log; none for what cannot be read, and for one channel under another format."""
-    if ".log" not in path.suffixes[-2:]:
-        with suppress(LogError):
-            found = {f"channel {message.channel}" for message in islice(read_log(path), CHANNEL_SCAN_LINES)}
-            return found if len(found) > 1 else set()
-        return set()
-    try:
-        with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as text:
-            words = [line.split(maxsplit=2) for line in islice(text, CHANNEL_SCAN_LINES)]
-    except (OSError, EOFError, ValueError):
-        return set()
-    return {word[1] for word in words if len(word) == 3 and word[0].startswith("(")}
+def log_of(config: Config, path: Path) -> Log:
+    """The log, of which the frames of the configured channel are read."""
+    return Log(path, config.log_channel or config.bus.channel, demanded=config.log_channel is not None)

@@ -11,11 +11,11 @@ from __future__ import annotations
 import csv
 import math
 import re
-from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.can.log_lines import LogLines
 from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
 from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.files import LIMITS, opened, plain_bytes, read_all, text_lines
 from soilbus.offline.recordings import Recordings, check_different
 from soilbus.offline.replay import LogError, log_names
 from soilbus.pipeline.estimator import WindowEstimator
@@ -48,6 +48,8 @@ MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "<na>", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
 SEPARATORS = ",;\t"
 """Between the cells of a table; a spreadsheet writes semicolons or tabs where the comma is in numbers."""
+LEAST_CELL = 8
+"""Bytes of a cell in memory at least."""
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
@@ -291,26 +293,15 @@ def _csv(path: Path, needed: Sequence[str]) -> Columns:
 
 def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
     """Rows of a file with cells, and what separates these."""
-    with path.open("rb") as file:
-        is_utf_16 = file.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE)
     try:
-        try:
-            return _rows_in(path, "utf-16" if is_utf_16 else "utf-8-sig", needed)
-        except UnicodeDecodeError:
-            if is_utf_16:
-                raise
-            return _rows_in(path, "cp1252", needed)  # of spreadsheets on Windows
+        with opened(path) as stream:
+            lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
+            first = next((line for line in lines if line.strip()), "")
+            separator = separator_of(first, needed)
+            rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)
+            return [row for row in rows if row], separator
     except (ValueError, csv.Error) as error:
         raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
-
-
-def _rows_in(path: Path, encoding: str, needed: Sequence[str]) -> tuple[list[list[str]], str]:
-    with path.open(newline="", encoding=encoding) as text:
-        lines = LogLines(text)
-        first = next((line for line in lines if line.strip()), "")
-        separator = separator_of(first, needed)
-        rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)
-        return [row for row in rows if row], separator
 
 
 def separator_of(header: str, names: Collection[str]) -> str:
@@ -362,11 +353,19 @@ def _parquet(path: Path, needed: Sequence[str]) -> Columns:
     except ModuleNotFoundError:
         raise TableError(f"{path}: a Parquet file needs the extra soilbus[tables]") from None
     try:
-        _check_columns(path, parquet.read_schema(path).names, needed)
-        table = parquet.read_table(path, columns=list(needed))
-    except arrow.ArrowException as error:
+        with parquet.ParquetFile(path) as file:
+            _check_columns(path, file.schema_arrow.names, needed)
+            check_cells(file.metadata.num_rows * len(needed))
+            table = file.read(columns=list(needed))
+    except (arrow.ArrowException, ValueError) as error:
         raise TableError(f"{path}: not a Parquet file that can be read ({one_line(error, 100)})") from None
     return {name: table.column(name).to_pylist() for name in needed}
+
+
+def check_cells(cells: int) -> None:
+    """Raise ValueError where a Parquet file has too many cells for the memory, which its size does not show."""
+    if cells > LIMITS.whole // LEAST_CELL:
+        raise ValueError(f"{cells} cells are too many")
 
 
 def _check_columns(source: Path | str, header: Sequence[str], needed: Sequence[str]) -> None:

@@ -234,7 +234,7 @@ class Intake:
         delays: Mapping[str, float] | None = None,
         options: ReceptionOptions = RECEPTION,
     ) -> None:
-        self._config, self._database, self._delays, self._options = config, database, delays, options
+        self.config, self._database, self._delays, self._options = config, database, delays, options
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config, database))
         self.rig = rig_of(config)
@@ -260,7 +260,7 @@ class Intake:
 
     def of_another_recording(self) -> Intake:
         """A new intake without any data, which continues the counts of windows, frames and refusals."""
-        other = Intake(self._config, self._database, self._delays, self._options)
+        other = Intake(self.config, self._database, self._delays, self._options)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
         return other
@@ -330,7 +330,10 @@ class Intake:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
     def due(self, now: float) -> list[WindowTask]:
-        """All windows that ended at or before `now` [s] and were not returned yet."""
+        """All windows that ended at or before `now` [s] and were not returned yet.
+
+        A hop without any sample ends no window: its data would be those of the one before.
+        """
         tasks, self._ready = self._ready, []
         if self._bins is None:
             self.ingest(now)
@@ -340,7 +343,8 @@ class Intake:
                 self._screen_the_rest()
                 self._restart()
                 break
-            tasks.append(self._task(self._bins, self.next_end))
+            if self.next_end - self._newest <= self._settings.hop:
+                tasks.append(self._task(self._bins, self.next_end))
             self.next_end += self._settings.hop
         return tasks
 
@@ -373,7 +377,7 @@ class Intake:
         window = completed(raw, self.rig)
         self.refusals.note_outliers(bins.new_outliers())
         missing = [c.name for c in self.needed if c.name not in self.last_seen]
-        missing += ["ground_speed"] if self._config.signals.ground_speed is None else []
+        missing += ["ground_speed"] if self.config.signals.ground_speed is None else []
         missing += [] if self.rig.wheels else ["wheels"]
         covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
         stale = self.stale(end)

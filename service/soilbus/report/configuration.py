@@ -16,6 +16,7 @@ from cantools.database.can import Database
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
+from soilbus.can.logs import Log
 from soilbus.can.mapping import AXLE_ROLES, SHARED_ROLES, WHEEL_ROLES, channels_of, without_unit
 from soilbus.config.model import Config, Form, Signal, Table
 from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
@@ -155,6 +156,20 @@ def _measured(config: Config) -> Iterator[str]:
         )
         if wheels or axles or getattr(config.signals, quantity, None) is not None:
             yield quantity
+
+
+def log_report(log: Log, found: Survey) -> str:
+    """What a log is, how long, of which channels, and which of the mapped messages it holds."""
+    mapped = dict.fromkeys(seen.channel.message for seen in found.seen)
+    heard = {seen.channel.message for seen in found.seen if seen.count or seen.refused}
+    missing = [name for name in mapped if name not in heard]
+    channels = ", ".join(f"{name} {n}" for name, n in sorted(log.channels.items()) if name)
+    lines = [
+        f"{log.name}: {log.kind}, {log.span:.1f} s, {log.channels.total()} frames",
+        f"channels: {channels or 'not named'}" + (f"; read: {log.chosen}" if log.left_out else ""),
+        f"mapped messages: {len(heard)} of {len(mapped)}" + (f"; not in it: {', '.join(missing)}" if missing else ""),
+    ]
+    return "\n" + "\n".join(lines) + "\n"
 
 
 def survey_report(found: Survey) -> str:

@@ -33,6 +33,8 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     """
     counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
+    if counts.elsewhere:
+        heard += f"; {counts.elsewhere} frames of other channels left out"
     if pipeline.admission.missed:
         heard += f"; {pipeline.admission.missed} skipped by their counters"
     doubted = list(doubts(counts.received, counts.refused).values())

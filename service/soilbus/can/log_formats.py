@@ -1,0 +1,384 @@
+"""The formats of logs that people have, each told by its content and read as frames with their channels.
+
+    first bytes -> Format(name, frames)         frames(stream) -> batches of (channels, frames)
+
+python-can reads ASC, BLF, TRC and MF4; candump (can/candump.py), CSV and BUSMASTER are read here.
+"""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import re
+import sqlite3
+import struct
+import sys
+import traceback
+import zlib
+from base64 import b64decode
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime, timedelta
+from io import BufferedReader, RawIOBase
+from pathlib import Path
+from shutil import copyfileobj
+from tempfile import NamedTemporaryFile
+from typing import NamedTuple
+
+import can
+
+from soilbus.can.candump import Batch, candump_batches, is_candump, of_message
+from soilbus.files import LIMITS, text_lines, within_ratio
+
+HEAD = 1 << 13
+"""Bytes at the begin of a log by which its format is told."""
+WRAP = 1 << 32
+"""Microseconds after which the stamps of an analyser of 32 bits begin again."""
+DAY = 86400.0
+"""Seconds after which a clock of hours, minutes and seconds begins again."""
+
+
+class Format(NamedTuple):
+    """Name of a format for a user, and the reader of a stream of it, which raises all kinds on a damaged file."""
+
+    name: str
+    batches: Callable[[BufferedReader], Iterator[Batch]]
+
+
+class MissingExtraError(Exception):
+    """What reads this format is not installed; the text says what to install."""
+
+
+def format_of(head: bytes) -> Format:
+    """The format of a log by its first bytes; ValueError where it is none, with what it is instead."""
+    for mark, found in _BINARY.items():
+        if head.startswith(mark):
+            return found
+    for mark, what in _NO_FRAMES.items():
+        if head.startswith(mark):
+            raise ValueError(f"{what}, without CAN frames")
+    is_wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")
+    text = head.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines:
+        return Format("an empty file", lambda _: iter(()))
+    first = lines[0]
+    if first.startswith("***BUSMASTER"):
+        return Format("BUSMASTER log", lambda stream: busmaster(text_lines(stream)))
+    if csv := _csv_of(first):
+        return Format(csv.name, lambda stream: _of_csv(csv, text_lines(stream)))
+    if first.startswith(";") or _TRC_LINE.match(first):
+        return Format("PCAN TRC log", lambda stream: map(of_message, can.TRCReader(text_lines(stream))))  # type: ignore[arg-type]
+    if any(map(_ASC_LINE.match, lines)):
+        return Format("Vector ASC log", lambda stream: asc(text_lines(stream)))
+    if any(map(is_candump, lines)):
+        return Format("candump log", lambda stream: candump_batches(text_lines(stream)))
+    if "\0" in text or "\ufffd" in text:
+        raise ValueError("binary data of no known format")
+    if columns := [cell for cell in re.split("[,;\t]", first) if cell.strip()][1:]:
+        raise ValueError(f"a table, whose {len(columns) + 1} columns are not those of CAN frames")
+    raise ValueError("text of no known format")
+
+
+# --- text
+
+
+_ASC_LINE = re.compile(
+    r"date\s+\w+\s.*\d|base\s+(hex|dec)\b|begin\s+triggerblock\b|//\s*version\b"
+    r"|\d+\.\d+\s+(\d+\s+(\w+\s+[TR]x|ErrorFrame)|CANFD\s)",
+    re.IGNORECASE,
+)
+_TRC_LINE = re.compile(r"\d+\)\s+\d")
+_ASC_NO_FRAME = re.compile(r"\s*+[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s)")
+"""Events that python-can would take for frames: "Start of measurement" of CAN FD, requests to send."""
+RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
+
+
+def asc(lines: Iterable[str]) -> Iterator[Batch]:
+    """Frames of a Vector ASC log.
+
+    Its stamps count from its begin.  Events between frames do not come from the reader, so stamps that only say how
+    long after the last event each came cannot be summed up: ValueError.
+    """
+    reader = can.ASCReader(line for line in lines if not _ASC_NO_FRAME.match(line))  # type: ignore[arg-type]
+    last = float("-inf")
+    for message in reader:
+        if message.timestamp < last and reader.timestamps_format == "relative":
+            raise ValueError(RELATIVE)
+        last = message.timestamp
+        yield of_message(message, 1)
+
+
+class _Csv(NamedTuple):
+    """Name of a CSV of frames, the columns by which it is told, and the frame of a row of all its columns."""
+
+    name: str
+    columns: frozenset[str]
+    frame: Callable[[Mapping[str, str]], tuple[float, int, bool, bytes, int, bool, bool]]
+    """Time [s], identifier, whether extended, data, length, whether remote, whether an error."""
+    wraps: bool = False
+    """Whether the stamps begin again after 32 bits of microseconds."""
+
+
+def _truth(text: str) -> bool:
+    return text.lower() in ("1", "true")
+
+
+_ROWS = (
+    _Csv(
+        "SavvyCAN (GVRET) CSV", frozenset({"time stamp", "id", "extended", "len", "d1"}),
+        lambda row: (
+            int(row["time stamp"]) / 1e6, int(row["id"], 16), _truth(row["extended"]),
+            bytes(int(cell, 16) for i in range(1, 65) if (cell := row.get(f"d{i}", ""))), int(row["len"]), False, False,
+        ),
+        wraps=True,
+    ),
+    _Csv(
+        "CANedge CSV", frozenset({"timestampepoch", "id", "ide", "databytes"}),
+        lambda row: (
+            float(row["timestampepoch"]), int(row["id"], 16), _truth(row["ide"]), bytes.fromhex(row["databytes"]),
+            int(row.get("datalength", len(row["databytes"]) // 2)), _truth(row.get("rtr", "0")), False,
+        ),
+    ),
+    _Csv(
+        "CSV of python-can", frozenset({"timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"}),
+        lambda row: (
+            float(row["timestamp"]), int(row["arbitration_id"], 16), _truth(row["extended"]),
+            b64decode(row["data"], validate=True), int(row["dlc"]), _truth(row["remote"]), _truth(row["error"]),
+        ),
+    ),
+)  # fmt: skip
+
+
+def _names(header: str) -> list[str]:
+    return [cell.strip().lower() for cell in header.replace(";", ",").split(",")]
+
+
+def _csv_of(header: str) -> _Csv | None:
+    """The kind of CSV with this first line; None where it is none of frames."""
+    return next((csv for csv in _ROWS if csv.columns <= set(_names(header))), None)
+
+
+def is_csv_of_frames(header: str) -> bool:
+    """Whether a CSV with this first line is a log of frames."""
+    return _csv_of(header) is not None
+
+
+def _of_csv(csv: _Csv, lines: Iterable[str]) -> Iterator[Batch]:
+    rows = iter(lines)
+    names = _names(next(line for line in rows if line.strip()))
+    late, last = 0.0, float("-inf")
+    for line in rows:
+        if not line.strip():
+            continue
+        cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
+        if len(cells) > len(names):
+            cells = [*cells[: len(names)], *filter(None, cells[len(names) :])]  # a comma at the end of a line
+        row = dict(zip(names, cells, strict=len(cells) > len(names)))
+        try:
+            t, identifier, extended, data, length, remote, error = csv.frame(row)
+        except KeyError as name:
+            raise ValueError(f"a line without {name}") from None
+        if csv.wraps and last - t > WRAP / 2e6 and last < WRAP / 1e6:
+            late += WRAP / 1e6
+        last = t
+        if not remote and not error and len(data) != length:
+            raise ValueError(f"a frame of {length} bytes has {len(data)}")
+        channel = row.get("bus") or row.get("buschannel") or ""
+        yield (channel,), [(t + late, identifier & 0x1FFFFFFF, extended, data, remote, error)]
+
+
+_BUSMASTER_DATE = re.compile(r"\*\*\*START DATE AND TIME (\d+):(\d+):(\d+) ")
+
+
+def busmaster(lines: Iterable[str]) -> Iterator[Batch]:
+    """Frames of a log of BUSMASTER; its stamps are the time of the day, or count from its begin.
+
+    Raises ValueError where they only say how long after the frame before each came.
+    """
+    base, midnight, turn, last = 16, 0.0, 0.0, 0.0
+    in_day = True
+    for line in lines:
+        if line.startswith("***"):
+            if line.startswith("***DEC"):
+                base = 10
+            elif line.startswith("***RELATIVE MODE"):
+                raise ValueError("its stamps are relative to the frame before: log in system or absolute mode")
+            elif line.startswith("***ABSOLUTE MODE"):
+                in_day = False
+            elif found := _BUSMASTER_DATE.match(line):
+                day, month, year = map(int, found.groups())
+                midnight, turn, last = datetime(year, month, day, tzinfo=UTC).timestamp(), 0.0, 0.0
+            continue
+        words = line.split()
+        if not words:
+            continue
+        stamp, _, channel, identifier, kind, length, *data = words
+        hours, minutes, seconds, parts = stamp.split(":")  # the last in units of 0.1 ms
+        t = timedelta(hours=int(hours), minutes=int(minutes), seconds=int(seconds)).total_seconds() + int(parts) / 1e4
+        if last - t > DAY / 2.0:
+            turn += DAY
+        last = t
+        remote, n = "r" in kind.lower(), int(length)
+        content = b"" if remote else bytes(int(byte, base) for byte in data[:n])
+        if not remote and len(content) != n:
+            raise ValueError(f"a frame of {n} bytes has {len(content)}")
+        number = int(identifier, 16 if identifier.lower().startswith("0x") else base)
+        frame = (t + turn + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
+        yield (channel,), [frame]
+
+
+# --- binary
+
+
+class _PlainBlf(RawIOBase):
+    """A BLF file with the containers unpacked, each bounded, for python-can's reader, which would unpack any size."""
+
+    _BASE, _CONTAINER = struct.Struct("<4sHHLL"), struct.Struct("<H6xL4x")
+    _IS_CONTAINER, _IS_DEFLATED = 10, 2
+
+    def __init__(self, stream: BufferedReader) -> None:
+        self._stream = stream
+        self._packed = self._plain = 0
+        head = stream.read(8)
+        self._left = head + self._exactly(max(struct.unpack("<4xL", head)[0] - 8, 0))
+
+    def read(self, size: int = -1) -> bytes:
+        """The next bytes; nothing more at the end."""
+        while len(self._left) < size and (more := self._next()):
+            self._left += more
+        found, self._left = self._left[:size], self._left[size:]
+        return found
+
+    def _exactly(self, size: int) -> bytes:
+        if size > LIMITS.block:
+            raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
+        content = self._stream.read(size)
+        if len(content) < size:
+            raise ValueError("cut off within a block")
+        return content
+
+    def _next(self) -> bytes:
+        head = self._stream.read(self._BASE.size)
+        if not head.strip(b"\0"):  # the end, which may be padded
+            return b""
+        mark, length, version, size, kind = self._BASE.unpack(head)
+        body = self._exactly(max(size - len(head), 0))
+        padding = self._stream.read(size % 4)
+        if mark != b"LOBJ" or kind != self._IS_CONTAINER:
+            return head + body + padding
+        method, _ = self._CONTAINER.unpack_from(body)
+        content = body[self._CONTAINER.size :]
+        if method == self._IS_DEFLATED:
+            decoder = zlib.decompressobj()
+            content = decoder.decompress(content, LIMITS.block)
+            if decoder.unconsumed_tail:
+                raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
+            if not decoder.eof:
+                raise ValueError("cut off within a block")
+            method = 0
+        self._packed, self._plain = self._packed + len(body), self._plain + len(content)
+        within_ratio(self._packed, self._plain)
+        size = self._BASE.size + self._CONTAINER.size + len(content)
+        head = self._BASE.pack(mark, length, version, size, kind)
+        return head + self._CONTAINER.pack(method, len(content)) + content + bytes(size % 4)
+
+
+def _blf(stream: BufferedReader) -> Iterator[Batch]:
+    return (of_message(message, 1) for message in can.BLFReader(_PlainBlf(stream)))  # type: ignore[arg-type]
+
+
+@contextmanager
+def _placed(stream: BufferedReader) -> Iterator[Path]:
+    """The path of a copy of a stream, for libraries that go to and fro in a file."""
+    with NamedTemporaryFile(prefix="soilbus-") as file:
+        copyfileobj(stream, file)
+        file.flush()
+        yield Path(file.name)
+
+
+_MF4_BLOCK = re.compile(rb"##DZ....(.{8})\0{8}(..)([\0-\xff]).(.{4})(.{8})(.{8})", re.DOTALL)
+
+
+def _mf4(stream: BufferedReader) -> Iterator[Batch]:
+    if can.io.mf4.asammdf is None:  # type: ignore[attr-defined]
+        raise MissingExtraError("this format needs soilbus[mf4]")
+    with _placed(stream) as path:
+        _check_mf4_blocks(path)
+        is_empty = True
+        with _mf4_reader(path) as reader:
+            for message in reader:
+                is_empty = False
+                yield of_message(message)
+        if is_empty:
+            raise ValueError("it has no CAN frames: decoded signals, perhaps")
+
+
+def _mf4_reader(path: Path) -> can.MF4Reader:
+    usual = sys.unraisablehook
+    try:
+        return can.MF4Reader(path)
+    except Exception as error:
+        sys.unraisablehook = lambda _: None  # asammdf's destructor fails on what its constructor has left unmade
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+        raise
+    finally:
+        sys.unraisablehook = usual
+
+
+def _check_mf4_blocks(path: Path) -> None:
+    """Raise ValueError where a deflated block unpacks to more than its size allows."""
+    size = path.stat().st_size
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        plain = 0
+        for found in _MF4_BLOCK.finditer(content):
+            if int.from_bytes(found[1], "little") != 48 + int.from_bytes(found[6], "little"):
+                continue  # no block, but data that look like one
+            if found[3] not in b"\0\1":
+                raise ValueError("a block that is packed by other than deflate")
+            decoder, place = zlib.decompressobj(), found.end()
+            block = len(decoder.decompress(content[place : place + int.from_bytes(found[6], "little")], LIMITS.block))
+            if decoder.unconsumed_tail:
+                raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
+            plain += block
+            within_ratio(size, plain)
+
+
+_SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages"
+
+
+def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
+    """Frames of python-can's SQLite log; a view, a function or a virtual table in their place is refused."""
+    with _placed(stream) as path, closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as log:
+        log.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LIMITS.line)
+        log.execute("PRAGMA trusted_schema = OFF")
+        kinds = log.execute("SELECT type, sql FROM sqlite_schema WHERE name = 'messages'").fetchall()
+        if [(kind, sql.split()[1].upper()) for kind, sql in kinds if sql] != [("table", "TABLE")]:
+            raise ValueError("its messages are no table")
+
+        def allowed(action: int, table: str | None, *_: object) -> int:
+            reads = action == sqlite3.SQLITE_SELECT or (action == sqlite3.SQLITE_READ and table == "messages")
+            return sqlite3.SQLITE_OK if reads else sqlite3.SQLITE_DENY
+
+        log.set_authorizer(allowed)
+        for t, identifier, extended, remote, error, dlc, data in log.execute(_SQL):
+            message = can.Message(
+                timestamp=t, arbitration_id=identifier, is_extended_id=bool(extended), is_remote_frame=bool(remote),
+                is_error_frame=bool(error), dlc=dlc, data=data or b"",
+            )  # fmt: skip
+            yield of_message(message)
+
+
+_BINARY = {
+    b"LOGG": Format("BLF log", _blf),
+    b"MDF     4": Format("MF4 log", _mf4),
+    b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
+}
+_NO_FRAMES = {
+    b"\x89MCAP": "an MCAP file, such as replay --mcap writes of its results",
+    b"PAR1": "a Parquet table",
+    b"UnFinMF ": "an MDF file that was never finished",
+    b"MDF     ": "an MDF file of version 3",
+    b"PK\x03\x04": "a ZIP archive",
+}

@@ -1,0 +1,199 @@
+"""The limits of a log that is made to fill memory or time, and the channel whose frames are read."""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import struct
+import subprocess
+import sys
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import pytest
+
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.logs import Log, LogError
+from soilbus.config.file import parse_config
+from soilbus.config.model import ConfigError
+from soilbus.offline.replay import channel_notes, replay
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.simulator.reference import reference_configuration
+
+LINE = b"(1700000000.000000) can0 123#0011223344556677\n"
+
+
+def packed_lines(pack: Callable[..., object]) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        with pack(path, "wb") as file:  # type: ignore[attr-defined]
+            file.write(LINE * 200)
+            for _ in range(600 if pack is gzip.open else 200):
+                file.write(b" " * 60_000 + b"\n" if pack is gzip.open else LINE * 20_000)
+
+    return write
+
+
+def blf_of(containers: int, mebibytes: int) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        with can.BLFWriter(path) as log:
+            log(can.Message(timestamp=1.7e9, arbitration_id=0x123, is_extended_id=False, data=bytes(8)))
+        skipped = struct.pack("<4sHHLL", b"LOBJ", 32, 1, mebibytes << 20, 99)  # of no kind that is known
+        content = zlib.compress(skipped.ljust(mebibytes << 20, b"\0"), 9)
+        body = struct.pack("<H6xL4x", 2, mebibytes << 20) + content
+        size = 16 + len(body)
+        block = struct.pack("<4sHHLL", b"LOBJ", 16, 1, size, 10) + body + bytes(size % 4)
+        with path.open("ab") as file:
+            file.write(block * containers)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (packed_lines(lzma.open), "unpacks to more than 250 times its size"),
+        (packed_lines(gzip.open), "a line that is no frame|unpacks to more"),
+        (blf_of(64, 4), "unpacks to more than 250 times its size"),
+        (blf_of(1, 80), "a block of more than 64 MiB"),
+    ],
+    ids=["lines", "blanks", "containers", "container"],
+)
+def test_a_small_log_that_unpacks_to_much_is_refused_in_little_memory(
+    write: Callable[[Path], None], reason: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "bomb"
+    write(path)
+    n = 0
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=reason):
+            for n, _ in enumerate(Log(path).frames(), 1):  # noqa: B007
+                pass
+        assert tracemalloc.get_traced_memory()[1] < 150 * 2**20
+    finally:
+        tracemalloc.stop()
+    assert n >= 1
+
+
+def test_a_log_of_constant_data_is_no_bomb(tmp_path: Path) -> None:
+    path = tmp_path / "parked.log"
+    with lzma.open(path, "wb") as file:
+        file.writelines(b"(%.6f) can0 123#0000000000000000\n" % (1.7e9 + n) for n in range(100_000))
+    assert sum(1 for _ in Log(path).frames()) == 100_000
+
+
+MUX = """VERSION ""
+BU_: E
+BO_ 256 M: 8 E
+ SG_ Page M : 0|8@1+ (1,0) [0|0] "" E
+ SG_ Speed m1 : 8|16@1+ (0.001,0) [0|60] "m/s" E
+SG_MUL_VAL_ 256 Speed Page {ranges};
+"""
+
+
+def test_ranges_of_a_multiplexer_are_counted_not_expanded(tmp_path: Path) -> None:
+    path = tmp_path / "m.dbc"
+    config = parse_config({"dbc": {"input": [str(path)]}})
+    for ranges in ("0-4294967295", "0-99999, 100000 - 300000", "0-9" + "9" * 5000):
+        path.write_text(MUX.format(ranges=ranges))
+        tracemalloc.start()
+        try:
+            with pytest.raises(ConfigError, match=r"SG_MUL_VAL_ of Speed: .*more than 262144 values"):
+                load_databases(config)
+            assert tracemalloc.get_traced_memory()[1] < 64 * 2**20
+        finally:
+            tracemalloc.stop()
+    path.write_text(MUX.format(ranges="1-3, 7-7, 200-255"))
+    speed = load_databases(config).get_message_by_name("M").get_signal_by_name("Speed")
+    assert speed.multiplexer_ids == [1, 2, 3, 7, *range(200, 256)]
+
+
+def bursts(gap: float) -> str:
+    """Ten frames of a mapped message, then a silence, thirty times."""
+    return "".join(
+        f"({1.7e9 + gap * n + i / 1e3:.6f}) can0 18FF31C8#DB5DD05D755AC85A\n" for n in range(30) for i in range(10)
+    )
+
+
+def test_silence_makes_no_windows(tmp_path: Path) -> None:
+    config = reference_configuration()
+    path = tmp_path / "gaps.log"
+    path.write_text(bursts(59.0))
+    windows = list(replay(Pipeline(config, load_databases(config)), [path]))
+    assert len(windows) <= 30  # one for each burst; each second had one before
+
+
+# --- channels
+
+
+def two_channels(path: Path, first: str = "can0", second: str = "can1") -> Path:
+    path.write_text("".join(f"({n}.0) {first} 123#0{n}\n({n}.5) {second} 123#F{n}\n" for n in range(9)))
+    return path
+
+
+def content(log: Log) -> set[int]:
+    return {data[0] >> 4 for _, _, _, data, _, _ in log.frames()}
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted", "chosen"),
+    [
+        (("can0", "can1"), "can0", "can0"), (("can0", "can1"), "can1", "can1"), (("can0", "can1"), "1", "can1"),
+        (("1", "2"), "can0", "1"), (("1", "2"), "can1", "2"), (("1", "2"), "2", "2"),
+        (("0", "1"), "can0", "0"), (("0", "1"), "can1", "1"), (("vcan0", "vcan7"), "7", "vcan7"),
+    ],
+)  # fmt: skip
+def test_the_channel_is_chosen_by_name_or_number(
+    names: tuple[str, str], wanted: str, chosen: str, tmp_path: Path
+) -> None:
+    log = Log(two_channels(tmp_path / "two.log", *names), wanted)
+    assert content(log) == {0 if chosen == names[0] else 15}
+    assert (log.chosen, log.left_out) == (chosen, 9)
+    assert log.note.count(chosen) >= 1
+
+
+def test_a_channel_that_is_not_there_is_refused_where_it_is_demanded_or_there_are_several(tmp_path: Path) -> None:
+    log = two_channels(tmp_path / "two.log")
+    with pytest.raises(LogError, match="no frame of can5, but of can0 and can1: choose with --channel"):
+        list(Log(log, "can5").frames())
+    log.write_text("(1.0) can3 123#00\n")
+    alone = Log(log, "can0")
+    assert len(list(alone.frames())) == 1
+    assert alone.note == f"{log}: frames of can3, where bus.channel = can0; it has no other channel"
+    with pytest.raises(LogError, match="no frame of can0, but of can3"):
+        list(Log(log, "can0", demanded=True).frames())
+
+
+def test_a_channel_that_begins_late_is_not_lost_in_silence(tmp_path: Path) -> None:
+    path = tmp_path / "late.log"
+    path.write_text("".join(f"({n / 1e3}) can1 123#00\n" for n in range(3000)) + "(9.0) can0 123#00\n")
+    with pytest.raises(LogError, match="begins with can1 alone, but has can0 too: read it with --channel can0"):
+        list(Log(path, "can0").frames())
+    assert len(list(Log(path, "can0", demanded=True).path.read_text().splitlines())) == 3001
+
+
+def test_the_other_channels_frames_are_counted_and_said(tmp_path: Path) -> None:
+    config = reference_configuration()
+    lines = bursts(0.02)
+    path = tmp_path / "two.log"
+    path.write_text("".join(f"{line}\n{line.replace('can0', 'can1')}\n" for line in lines.splitlines()))
+    pipeline = Pipeline(config, load_databases(config))
+    list(replay(pipeline, [path]))
+    assert pipeline.admission.counts.elsewhere == 300
+    assert sum(pipeline.admission.counts.received.values()) == 300
+    assert channel_notes(config, [path]) == [
+        f"{path}: frames of can0 are read; those of can1 are left out (bus.channel, --channel)"
+    ]
+
+
+def test_check_says_of_standard_input_what_it_is() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "soilbus", "check", "--config", "tractor", "--channel", "can1", "--log", "-"],
+        input=bursts(0.02).replace("can0", "can1").encode() + LINE, capture_output=True, timeout=120.0, check=False,
+    )  # fmt: skip
+    said = done.stdout.decode()
+    assert "\nstandard input: candump log, 0.6 s, 301 frames\nchannels: can0 1, can1 300; read: can1\n" in said
+    assert "\nmapped messages: 1 of " in said
