@@ -346,7 +346,7 @@ class Tracker:
         self._last_run = gaussian, elapsed
 
     def start_from(self, other: Tracker, t: float) -> None:
-        """Take the soil that another tracker knows as the prior from `t` [s] on: the machine changed, not the ground."""
+        """Take the soil that another tracker knows as prior from `t` [s] on: the machine changed, not the ground."""
         known = other.newest_posterior
         if known is None:
             return
