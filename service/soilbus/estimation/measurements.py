@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import completed
+from soilbus.estimation.instrumentation import completed, straightened
 from soilbus.estimation.local_cubics import Series, curve_of
 from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
@@ -105,7 +105,7 @@ class Measurements:
         window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
-        straight = moving & ~in_turn
+        straight, window = moving & ~in_turn, straightened(window, rig)
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
