@@ -56,7 +56,7 @@ from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
-from soilbus.pipeline.determination import excitation_of, lacking, sinkage_range
+from soilbus.pipeline.determination import draft_is_known, excitation_of, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask, input_rejected
 from soilbus.pipeline.model_gap import GapWatch, PredictionWatch, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
@@ -254,7 +254,11 @@ class WindowEstimator:
             window.posterior, window.result.status, window.demand, window.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
-        return replace(window.result, traversability=self._with_state(decision, window))
+        result = window.result
+        if result.status is Status.VALID and not draft_is_known(decision.max_draft, self._settings):
+            result = replace(result, status=Status.NOT_EXCITED, reason="not_excited slip_range")
+            window = replace(window, result=result)
+        return replace(result, traversability=self._with_state(decision, window))
 
     def _with_state(self, decision: Traversability, window: Undecided) -> Traversability:
         """The decision with the state after hysteresis, and the time since the last valid window."""
