@@ -68,6 +68,18 @@ def test_a_format_that_a_worker_lacks_is_no_fault_of_the_log(config, tmp_path, m
     assert (outcome.fault, outcome.lasting) == (f"{tmp_path}/a.mf4: this format needs soilbus[mf4]", False)
 
 
+def test_a_log_that_takes_more_processor_time_than_its_size_allows_is_given_up(config, moved, tmp_path, monkeypatch):
+    log = tmp_path / "a.log"
+    log.write_text(moved(0.0))
+    job = Job(str(log), "T7", setup_of(config, "t"))
+    assert part_of(job, soilbus.__version__).fault is None
+    monkeypatch.setattr("soilbus.offline.parts.CPU_FREE", 0.0)
+    monkeypatch.setattr("soilbus.offline.parts.CPU_PER_BYTE", 0.0)
+    outcome = part_of(job, soilbus.__version__)
+    assert outcome.fault == f"{log}: given up: it takes more processor time than a log of its size may"
+    assert outcome.lasting
+
+
 def test_a_log_that_left_its_folder_keeps_its_windows(client, config, moved, tmp_path):
     logs, out = tmp_path / "fleet/T7", tmp_path / "out"
     logs.mkdir(parents=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import re
 import tomllib
 from pathlib import Path
@@ -208,6 +209,30 @@ def test_files_that_are_no_tables_are_named(tmp_path):
     ):  # fmt: skip
         with pytest.raises(TableError, match=complaint):
             runs_of(rig(), tmp_path / name)
+
+
+def test_a_packed_table_is_read_as_the_plain_one_within_limits(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text(AS_PLAIN)
+    (plain,) = runs_of(rig(), path)
+    path.write_bytes(lzma.compress(AS_PLAIN.encode()))
+    (packed,) = runs_of(rig(), path)
+    np.testing.assert_array_equal(packed.window.load, plain.window.load)
+    with lzma.open(path, "wb") as file:
+        file.write(AS_PLAIN.encode())
+        file.writelines([b"a,1,0.1,1,1,1\n" * 100_000] * 40)
+    with pytest.raises(TableError, match="unpacks to more than 250 times its size"):
+        runs_of(rig(), path)
+
+
+def test_a_parquet_file_of_too_many_cells_is_refused_before_it_is_read(tmp_path):
+    arrow = pytest.importorskip("pyarrow")
+    column, path = arrow.array(np.zeros(4_000_000, np.int8)), tmp_path / "t.parquet"
+    names = ["bed", "load", "slip", "pull", "torque", "sink"]
+    pytest.importorskip("pyarrow.parquet").write_table(arrow.table(dict.fromkeys(names, column)), path)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(TableError, match="20000000 cells are too many"):
+        runs_of(rig(), path)
 
 
 def test_parquet_tells_the_same_as_csv(tmp_path, measured):

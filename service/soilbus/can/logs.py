@@ -72,6 +72,7 @@ class Log:
         self.path, self.wanted, self._demanded = path, channel, demanded
         self.kind, self.chosen, self.span, self._given = "", "", 0.0, 0
         self.channels: Counter[str] = Counter()
+        self._is_awaited = False
 
     @property
     def name(self) -> str:
@@ -158,6 +159,8 @@ class Log:
                 raise fault
             for batch in batches:
                 yield from self._of_channel(batch)
+        if self._is_awaited:
+            raise self._not_in_it()
         if self.wanted and self.chosen != (meant := _meant(self.wanted, self.channels)) and meant is not None:
             raise LogError(
                 f"{self.name}: begins with {self.chosen} alone, but has {meant} too: read it with --channel {meant}"
@@ -179,17 +182,23 @@ class Log:
         if not self.wanted or not self.channels:
             return
         chosen = _meant(self.wanted, self.channels)
-        if chosen is None and len(self.channels) == 1 and (not self._demanded or not min(self.channels)):
+        if chosen is None and len(self.channels) == 1 and not (self._demanded and min(self.channels)):
             chosen = min(self.channels)
+        if chosen is None and self._demanded:  # it may begin later
+            self._is_awaited = True
+            return
         if chosen is None:
-            raise LogError(
-                f"{self.name}: no frame of {self.wanted}, but of {_listed(sorted(self.channels))}: "
-                f"choose with --channel"
-            )
+            raise self._not_in_it()
         self.chosen = chosen
+
+    def _not_in_it(self) -> LogError:
+        there = _listed(sorted(self.channels))
+        return LogError(f"{self.name}: no frame of {self.wanted}, but of {there}: choose with --channel")
 
     def _of_channel(self, batch: Batch) -> list[Frame]:
         channels, frames = batch
+        if self._is_awaited and (meant := _meant(self.wanted, self.channels)) is not None:
+            self.chosen, self._is_awaited = meant, False
         self._given += len(frames)
         if not self.wanted or set(channels) <= {self.chosen}:
             return frames

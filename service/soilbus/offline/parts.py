@@ -49,9 +49,9 @@ from soilbus.words import one_line
 MISSING = "no such file"
 CPU_FREE = 600.0
 """Processor time [s] that any log may take."""
-CPU_PER_BYTE = 60.0 / 2**20
-"""Processor time [s] that it may take beside for each byte.  A candump log of a drive takes 0.3 s a MiB, packed by xz
-2 s; one of a few frames a second, packed, 60 s."""
+CPU_PER_BYTE = 300.0 / 2**20
+"""Processor time [s] that it may take beside for each byte.  A drive on a full bus took 1.2 s a MiB as candump text,
+7 s a MiB packed by xz; five frames a second with data that repeat, packed by xz, took 1500 s a MiB: 7 kB for 40 min."""
 WINDOWS_OF_PIECE = 5_000
 """Windows of a log that are handed over at once; 1 kB each.  Of messages of 10 MB Dask warns; a log of an hour, with
 a window every second, is one piece."""

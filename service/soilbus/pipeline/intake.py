@@ -253,6 +253,7 @@ class Intake:
         self._limits = ReportedLimits(motors_of(config, self.rig), options.limit_samples)
         self._index = 0
         self.epoch = 0
+        self._silent_hops = LONGEST_GAP / config.estimator.hop  # that may still end windows
         self._ready: list[WindowTask] = []
         self._bins: Bins | None = None
         self._restart()
@@ -332,7 +333,8 @@ class Intake:
     def due(self, now: float) -> list[WindowTask]:
         """All windows that ended at or before `now` [s] and were not returned yet.
 
-        A hop without any sample ends no window: its data would be those of the one before.
+        Hops without any sample end windows for LONGEST_GAP in all; each hop with samples earns one more.  So a log of
+        short bursts far apart makes at most two windows a burst.
         """
         tasks, self._ready = self._ready, []
         if self._bins is None:
@@ -343,8 +345,11 @@ class Intake:
                 self._screen_the_rest()
                 self._restart()
                 break
-            if self.next_end - self._newest <= self._settings.hop:
+            is_heard = self.next_end - self._newest <= self._settings.hop
+            if is_heard or self._silent_hops >= 1.0:
                 tasks.append(self._task(self._bins, self.next_end))
+            change = 1.0 if is_heard else -1.0
+            self._silent_hops = min(max(self._silent_hops + change, 0.0), LONGEST_GAP / self._settings.hop)
             self.next_end += self._settings.hop
         return tasks
 
