@@ -27,7 +27,15 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, sinkage
 
-__all__ = ["Excitation", "contact_pressure", "draft_is_known", "excitation_of", "lacking", "loaded_depths", "sinkage_range"]
+__all__ = [
+    "Excitation",
+    "contact_pressure",
+    "draft_is_known",
+    "excitation_of",
+    "lacking",
+    "loaded_depths",
+    "sinkage_range",
+]
 
 
 class Excitation(NamedTuple):
