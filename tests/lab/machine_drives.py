@@ -1,4 +1,4 @@
-"""Valid windows and held intervals on drives of machines that are not the project's: ends with 1 where a limit is missed.
+"""Valid windows and held intervals on drives of foreign machines: ends with 1 where a limit is missed.
 
     python -m tests.lab.machine_drives           four multibody drives, their first minute and a half
     python -m tests.lab.machine_drives --foreign four drives by other formulas
