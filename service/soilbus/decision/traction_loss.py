@@ -315,7 +315,7 @@ def _without_torque(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDAr
 
 
 def disengaged(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which wheels (W,) a shaft of both axles does not turn, by their speeds after `since` [s]; else as before."""
+    """Return which wheels (W,) a shaft of both axles does not turn, by speeds after `since` [s]; else as before."""
     of_shaft, apart = _disengaged(window.rows(np.flatnonzero(window.t > since)), rig, before)
     return of_shaft & apart
 

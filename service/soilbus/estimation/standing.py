@@ -4,8 +4,8 @@
     torque     T = T_soil + J domega/dt                          inertia J of a wheel
     channel    y(t) = x(t - d),   x = y + d dy/dt                d: lateness beside torque and wheel speed
 
-Each is linear in its parameter to first order, about none of it, so its parameter is one more gain: a prior with mean 0,
-a column of the Jacobian, a posterior that goes on from window to window.  L / V and d are short beside a second.
+Each is linear in its parameter to first order, about 0, so its parameter is one more gain: a prior with mean 0, a
+column of the Jacobian, a posterior that goes on from window to window.  L / V and d are short beside a second.
 
 References
 ----------

@@ -152,9 +152,8 @@ def of_soft_ground(tracked: TrackerOutput) -> TrackerOutput:
     """The same, as sure of it, of a ground that holds nothing."""
     soft = np.array(SOILS["wet_clay"]) * [0.05, 0.05, 1.0, 0.3, 0.2, 1.0]
     fit = fit_of(tracked)
-    gaussian = dataclasses.replace(fit.reported, soil=soft)
     return dataclasses.replace(
-        tracked, fit=dataclasses.replace(fit, mode=gaussian, marginalised=None, second_mode=None)
+        tracked, fit=dataclasses.replace(fit, mode=dataclasses.replace(fit.mode, soil=soft), form=None)
     )
 
 
@@ -408,7 +407,7 @@ class TrueTracker(Tracker):
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         tracked = self.drive.truth(window, end)
-        self.said = fit_of(tracked).reported
+        self.said = fit_of(tracked).mode
         return tracked
 
 
