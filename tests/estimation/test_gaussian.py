@@ -124,7 +124,7 @@ def test_without_prior_variance_the_likelihood_factor_is_the_gaussian():
 def test_consecutive_windows_determine_k_c_as_one_long_window_does(seed):
     """With Gaussians of log k_c, six windows of 10 s gave k_c of this clay 2.5 times too small, to a third."""
     windows_, whole = fits(CLAY, seed, 10.0), fits(CLAY, seed, 60.0)
-    (log, std), (at_once, std_at_once) = of_k_c(windows_[-1].reported.posterior), of_k_c(whole[-1].reported.posterior)
+    (log, std), (at_once, std_at_once) = of_k_c(windows_[-1].posterior), of_k_c(whole[-1].posterior)
     assert abs(log - at_once) < std_at_once
     assert 0.7 < std / std_at_once < 1.6
     assert abs(log - np.log(SOILS[CLAY].k_c)) < 2.5 * std

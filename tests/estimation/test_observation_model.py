@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
+from soilbus.estimation.standing import STANDING
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -194,8 +195,9 @@ def test_gains_are_named_in_the_order_of_their_columns(few):
         *(f"{q}.{w}" for q in GAIN_QUANTITIES[:3] for w in rig.wheels),
         "ground_speed",
         "draft",
+        *STANDING,
     ]
-    assert problem.gain_std == pytest.approx([0.005] * 8 + [0.0015] * 4 + [0.002, 0.005])
+    assert problem.gain_std[:14] == pytest.approx([0.005] * 8 + [0.0015] * 4 + [0.002, 0.005])
 
 
 def test_acceleration_from_speed_and_its_variance():

@@ -324,6 +324,8 @@ class Tracker:
         self.effects, self.free = tuple(effects), tuple(free)
         self._new_soil_prior = new_soil_prior(prior)
         self._last_run: tuple[Gaussian, float] | None = None
+        self._components = VarianceComponents(rig.options.variance)
+        self._posteriors: list[tuple[float, Gaussian]] = []
         self.reset()
 
     @property
@@ -363,7 +365,7 @@ class Tracker:
         self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
-        self._posteriors: list[tuple[float, Gaussian]] = []
+        self._posteriors = []
         self._newest_posterior: Gaussian | None = None
         self._components = VarianceComponents(self.rig.options.variance)
 

@@ -71,6 +71,7 @@ _COLUMNS: tuple[tuple[str, Column], ...] = (
     ("traversability.age", Column("number", "s")),
     ("traversability.since_valid", Column("number", "s")),
     ("gaps.*", _RATIO),
+    ("prediction_error.*", _RATIO),
     ("warning.time_left", Column("number", "s")),
     ("warning.since", Column("number", "s")),
     ("warning.begun*", Column("number", "s")),

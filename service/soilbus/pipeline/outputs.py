@@ -143,6 +143,7 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
             "contradicted": decision.contradicted,
         },
         "gaps": dict(result.gaps),
+        "prediction_error": dict(result.prediction_error),
         "warning": {
             "state": str(result.watch.warning),
             "time_left": result.watch.time_left,
