@@ -180,6 +180,8 @@ MORE = OF_DECISION | {
     "soil_change",
     "gaps",
     "prediction_error",
+    "standing",
+    "noise_factors",
 }
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {

@@ -53,6 +53,7 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
+from soilbus.estimation.standing import STANDING, wheel_inertia
 from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
@@ -213,6 +214,8 @@ class WindowEstimator:
             failure=self._failure(tracked),
             gaps=self._predictions.gaps(self._settings.max_prediction_error),
             prediction_error=self._predictions.shares(),
+            standing=self._standing(fit),
+            noise_factors={kind: math.sqrt(f) for kind, f in self._tracker.components.factor.items()},
             channel_chi2=self._gap.chi2(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
@@ -354,6 +357,18 @@ class WindowEstimator:
         if tracked.fit is None or tracked.mismatch:
             return Estimate(0.0, self._gain_std[index])
         return tracked.fit.mode.gain(index)
+
+    def _standing(self, fit: Fit | None) -> dict[str, Estimate]:
+        """Return what a fit says of the standing parts that are not held, in SI."""
+        if fit is None or self.rig.chassis is None:
+            return {}
+        unit = {"wheel_inertia": float(wheel_inertia(self.rig).mean())}
+        gains = {name: fit.mode.gain(self._gain_names.index(name)) for name in STANDING}
+        return {
+            name: Estimate(unit.get(name, 1.0) * gain.value, unit.get(name, 1.0) * gain.std)
+            for name, gain in gains.items()
+            if gain.std > 0.0
+        }
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
