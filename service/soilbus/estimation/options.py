@@ -149,9 +149,7 @@ class TrackerOptions:
     """Fits of a first window, each with the variance components that the one before left: the factors of `d-base-0`
     then change by less than a tenth."""
     significance: float = 25.0
-    """Fall of -2 log evidence by two soils instead of one [1] from which the change is accepted; of -2 log posterior by
-    a longer transition, beyond the number of residuals left out, and by path curvature at knots; score statistic above
-    which sinkages are on a wrong scale: 5 sd of one unknown.  Curvature fits noise by about 9 in a window of 10 s."""
+    """Fall of -2 log evidence by two soils instead of one [1] from which a change is accepted: 5 sd of one unknown."""
     min_rows_per_soil: int = 30
     """Residuals that each of two soils needs before they are compared.  With 10 a border in `replay-bogging` is taken
     for a soil too early, with 90 two are found late."""
