@@ -97,7 +97,10 @@ def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
 
 
 def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else():
-    short, varied = (said("dry_sand", driven_windows.EXCITED, shift, seconds=2.0) for shift in (STILL, LEANING))
+    strict = ["estimator.max_bearing_std=0.05"]
+    short, varied = (
+        said("dry_sand", driven_windows.EXCITED, shift, overrides=strict, seconds=2.0) for shift in (STILL, LEANING)
+    )
     assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
     assert (varied.status, varied.reason) == (Status.VALID, "none")
 
@@ -120,7 +123,9 @@ def test_both_are_named_where_both_are_missing(soil):
 
 @pytest.mark.parametrize("soil", ["loam", "clayey_soil_38"])
 def test_the_pressure_at_the_depth_of_the_wheels_is_reported_all_the_same(soil):
-    result = said(soil, driven_windows.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.01"])
+    result = said(
+        soil, driven_windows.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.005"]
+    )
     assert result.status is Status.NOT_EXCITED
     width = 0.38
     at_wheel = result.posterior.bearing_pressure(result.sinkage["RL"], width)

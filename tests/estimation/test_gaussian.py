@@ -83,16 +83,6 @@ def test_the_prior_factor_is_the_product_of_likelihood_and_prior(name, simulated
     assert min(values) > -0.05  # -2 log prior is zero at its least value
 
 
-def test_a_conditioned_likelihood_factor_stays_gaussian_in_k_c(simulated):
-    one = simulated(SOILS["loam"], 1)
-    factor = fit_window(one.problem(), one.prior).mode.likelihood_factor(one.prior)
-    n = PARAMETERS.index("n")
-    held = factor.conditioned_on(n, float(np.log(factor.soil[n] * (1.02 + factor.offset[n]))))
-    along = factor.covariance[:, n] / factor.covariance[n, n]
-    assert held.soil[K_C] == factor.soil[K_C]
-    assert held.offset == pytest.approx(factor.offset + 0.02 * along[:6])
-
-
 def test_the_ridge_of_a_likelihood_factor_is_that_of_one_strength():
     """At one pressure only p = c + pressure tan phi is known: another mean on the ridge has the same ridge."""
     prior, pressure, wide = prior_of(reference_configuration()), 4e4, np.diag([1.0, 1.0, 1.0, 0.25, 0.36, 0.25])

@@ -8,8 +8,7 @@ prior) and the Gaussian there,
 
 `fit_window` finds it where nothing is known: the soil alone descends on a few instants, with loads and speeds as
 measured, from the prior's median, loam and the likeliest soils of the table until two descents meet; from the best end
-soil, gains and latents descend together on all instants.  Where the data allow a second mode, it is looked for too,
-and the two share the probability by their evidence.  `fit_warm` starts at the optimum of the window before.
+soil, gains and latents descend together on all instants.  `fit_warm` starts at the optimum of the window before.
 All return a `Fit`.
 """
 

@@ -143,15 +143,16 @@ class TrackerOptions:
 
     false_alarms_per_hour: float = 1.0
     """Windows an hour [1/h] in which noise alone makes the change detector search for another soil."""
+    steady_drift: float = 7.0
+    """Prior sd of a steady change of the soil in one window, in units of `Settings.drift` [1]: a field that changes as
+    one goes, beside a random walk."""
     several_soils: float = 3.0
     """Chi-square per residual [1], in units of what the windows before left, above which another soil is looked for."""
     first_rounds: int = 4
     """Fits of a first window, each with the variance components that the one before left: the factors of `d-base-0`
     then change by less than a tenth."""
     significance: float = 25.0
-    """Fall of -2 log evidence by two soils instead of one [1] from which the change is accepted; of -2 log posterior by
-    a longer transition, beyond the number of residuals left out, and by path curvature at knots; score statistic above
-    which sinkages are on a wrong scale: 5 sd of one unknown.  Curvature fits noise by about 9 in a window of 10 s."""
+    """Fall of -2 log evidence by two soils instead of one [1] from which a change is accepted: 5 sd of one unknown."""
     min_rows_per_soil: int = 30
     """Residuals that each of two soils needs before they are compared.  With 10 a border in `replay-bogging` is taken
     for a soil too early, with 90 two are found late."""

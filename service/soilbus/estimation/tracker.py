@@ -597,7 +597,11 @@ class Tracker:
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed, or fits much worse than the windows before: its data may be of several soils."""
-        return fit is None or not fit.converged or fit.chi2 > self.options.several_soils
+        return fit is None or not fit.converged or self.is_of_several_soils(fit)
+
+    def is_of_several_soils(self, fit: Fit) -> bool:
+        """Return whether residuals are larger than what earlier windows left: data of several soils, or a new fault."""
+        return math.isfinite(fit.chi2) and fit.chi2 > self.options.several_soils
 
     def _prior_at(self, t: float, problem: ObservationModel) -> Gaussian:
         """Posterior of the newest window that ended by t [s], plus drift since."""
@@ -643,7 +647,11 @@ class Tracker:
         """The fit as it is reported: with what the form of the contact leaves open."""
         if fit is None or not fit.converged:
             return fit
-        return replace(fit, form=self._form_posterior(objective, fit))
+        form = self._form_posterior(objective, fit)
+        half = self.options.steady_drift * self.settings.drift / 2.0  # the end of a window is half of it from its middle
+        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(fit.mode.soil)
+        mode = fit.mode.drifted(half**2 * (directions @ directions.T), np.zeros(len(fit.gains)))
+        return replace(fit, mode=mode, form=form)
 
     def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:
         """Part of a fit that the form of the model leaves open; None where the form is held."""

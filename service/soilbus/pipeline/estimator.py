@@ -421,7 +421,7 @@ class WindowEstimator:
         failure = self._failure(tracked)
         if fit is None or failure is not None:
             return Status.INVALID, "no_convergence"
-        if self._predictions.error() > self._settings.max_prediction_error:
+        if tracked.mismatch or self._predictions.error() > self._settings.max_prediction_error:
             return Status.DEGRADED, self._mismatch
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
@@ -445,7 +445,7 @@ class WindowEstimator:
     def _failure(self, tracked: TrackerOutput) -> str | None:
         """Kind of failure of a solve: not_finite or no_convergence; None for none."""
         fit = tracked.fit
-        if not tracked.mismatch or (fit is not None and fit.converged):
+        if not tracked.mismatch or (fit is not None and self._tracker.is_of_several_soils(fit)):
             return None
         return "no_convergence" if fit is not None or tracked.search_ended else "not_finite"
 

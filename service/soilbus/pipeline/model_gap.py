@@ -77,6 +77,15 @@ class _Sums:
                 total[0], total[1] = total[0] + pair[0], total[1] + pair[1]
         return {channel: one / other for channel, (one, other) in sums.items() if other > 0.0}
 
+    def medians(self) -> dict[str, float]:
+        """Return the square root of the median ratio of each channel."""
+        ratios: dict[str, list[float]] = {}
+        for _, found in self._seen:
+            for channel, (one, other) in found.items():
+                if other > 0.0:
+                    ratios.setdefault(channel, []).append(one / other)
+        return {channel: float(np.sqrt(np.median(values))) for channel, values in ratios.items()}
+
 
 class GapWatch:
     """Chi-square of each channel over the last SPAN."""
@@ -109,8 +118,11 @@ class PredictionWatch:
         return {channel: float(np.sqrt(ratio)) for channel, ratio in self._window.ratios().items()}
 
     def error(self) -> float:
-        """Return the largest of the shares; 0 before anything was predicted."""
-        return max(self.shares().values(), default=0.0)
+        """Return the largest of the channels' usual shares; 0 before anything was predicted.
+
+        The median over hops: a moment that is spoilt, or on another soil, is no fault of the model.
+        """
+        return max(self._window.medians().values(), default=0.0)
 
     def gaps(self, limit: float) -> dict[str, float]:
         """Return the channels whose share has been above the limit for minutes, the worst first."""
