@@ -160,9 +160,10 @@ MUTATIONS = (
         ("tests/daemon/test_state_store.py::test_each_fault_is_told_in_one_line",),
     ),
     Mutation(
-        "windows that overlap count as if they did not", "pipeline/model_gap.py",
-        "math.sqrt(2.0 * self._overlap / known.rows)", "math.sqrt(2.0 / known.rows)",
-        ("tests/daemon/test_gap.py::test_noise_alone_is_no_gap_however_few_residuals_there_are",),
+        "gaps are those of the last window", "pipeline/model_gap.py",
+        "self._minutes.ratios().items()", "self._window.ratios().items()",
+        ("tests/estimation/test_prediction.py::"
+         "test_a_watch_averages_squares_over_the_last_window_and_reports_gaps_of_minutes",),
     ),
     Mutation(
         "one repeated reading makes a sensor coarse", "sensors/consistency.py",

@@ -171,7 +171,18 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
 OF_DECISION = {"state", "reason", "capability", "warning"}
-MORE = OF_DECISION | {"solver", "search_ended", "window", "log", "soil_class", "soil_change", "gaps"}
+MORE = OF_DECISION | {
+    "solver",
+    "search_ended",
+    "window",
+    "log",
+    "soil_class",
+    "soil_change",
+    "gaps",
+    "prediction_error",
+    "standing",
+    "noise_factors",
+}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {
     "contradicted",

@@ -8,8 +8,6 @@ from scipy.stats import binom, chi2
 
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.pipeline.estimator import WindowEstimator
@@ -50,10 +48,7 @@ def of_drive(soil, sinkage, seed):
         config, soil, 10.0, driven_windows.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL
     )
     prior = prior_about(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
-    whole = with_nested_laplace(
-        problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)
-    ).reported
-    return deviations(whole.posterior, soil)
+    return deviations(fit_window(problem, prior).posterior, soil)
 
 
 @pytest.mark.parametrize("sinkage", [True, False], ids=["sinkage", "no sinkage"])
@@ -102,7 +97,10 @@ def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
 
 
 def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else():
-    short, varied = (said("dry_sand", driven_windows.EXCITED, shift, seconds=2.0) for shift in (STILL, LEANING))
+    strict = ["estimator.max_bearing_std=0.05"]
+    short, varied = (
+        said("dry_sand", driven_windows.EXCITED, shift, overrides=strict, seconds=2.0) for shift in (STILL, LEANING)
+    )
     assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
     assert (varied.status, varied.reason) == (Status.VALID, "none")
 
@@ -125,7 +123,9 @@ def test_both_are_named_where_both_are_missing(soil):
 
 @pytest.mark.parametrize("soil", ["loam", "clayey_soil_38"])
 def test_the_pressure_at_the_depth_of_the_wheels_is_reported_all_the_same(soil):
-    result = said(soil, driven_windows.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.01"])
+    result = said(
+        soil, driven_windows.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.005"]
+    )
     assert result.status is Status.NOT_EXCITED
     width = 0.38
     at_wheel = result.posterior.bearing_pressure(result.sinkage["RL"], width)

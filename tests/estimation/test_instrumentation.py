@@ -325,7 +325,7 @@ def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     left = rig.wheels.index("FL")  # it has no speed sensor
     assert slip[:, left].mean() == pytest.approx(true.mean(), abs=0.02)  # side loads that swing are not measured
     assert slip[:, left] == pytest.approx(true, abs=0.06)
-    tan_phi = fit.reported.posterior.tan_phi()
+    tan_phi = fit.posterior.tan_phi()
     # side loads that swing unseen: more than two deviations off
     assert tan_phi.value == pytest.approx(np.tan(prior_of(config).median[3]), abs=0.06)
 

@@ -63,8 +63,8 @@ def onto_clay():
 
 def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
     rng = np.random.default_rng(1)
-    root = 0.1 * rng.standard_normal((20, 20)) * np.concatenate([np.ones(6), GAIN_STD])[:, None]
-    gaussian = Gaussian(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(14), root @ root.T)
+    root = 0.1 * rng.standard_normal((6 + len(GAIN_STD),) * 2) * np.concatenate([np.ones(6), GAIN_STD])[:, None]
+    gaussian = Gaussian(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(len(GAIN_STD)), root @ root.T)
     for elapsed in (0.0, 60.0, GAIN_CORRELATION_TIME, 30 * GAIN_CORRELATION_TIME):
         left = prior_from_last_run(gaussian, PRIOR, GAIN_STD, elapsed)
         # simulated: dg = -g dt / T + sqrt(2 / T) std dW, whose steps over any time are known exactly
@@ -75,14 +75,16 @@ def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
         scale = np.outer(GAIN_STD, GAIN_STD)
         assert left.covariance[6:, 6:] / scale == pytest.approx(np.cov(wandered.T) / scale, abs=0.02)
         assert np.array_equal(left.soil, PRIOR.median)
-        assert np.array_equal(left.covariance[:6], np.diag(np.concatenate([PRIOR.log_std**2, np.zeros(14)]))[:6])
+        assert np.array_equal(
+            left.covariance[:6], np.diag(np.concatenate([PRIOR.log_std**2, np.zeros(len(GAIN_STD))]))[:6]
+        )
     prior = Gaussian.of(PRIOR, GAIN_STD)
     assert left.covariance == pytest.approx(prior.covariance)
     assert np.abs(left.gains / GAIN_STD).max() < 1e-12
 
 
 def test_a_gain_that_is_held_stays_held():
-    std = np.where(np.arange(14) % 2, GAIN_STD, 0.0)
+    std = np.where(np.arange(len(GAIN_STD)) % 2, GAIN_STD, 0.0)
     gaussian = Gaussian.of(PRIOR, GAIN_STD)
     left = prior_from_last_run(replace(gaussian, gains=GAIN_STD), PRIOR, std, 0.0)
     assert (left.gains == std).all()

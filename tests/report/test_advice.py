@@ -81,12 +81,12 @@ def window(reason: str, status: Status = Status.INVALID, **more) -> WindowResult
         ("turning", "drive straight"),
         ("no_convergence", "check signs and scales"),
         ("not_excited few_bins", "estimator.bin"),
-        ("model_mismatch", "5 times the noise off"),
+        ("model_mismatch", "the model predicts torque 31 % off"),
         ("internal_error", None),
     ],
 )
 def test_each_reason_has_its_advice(reason, says):
-    unknown = [window(reason, chi2=25.0)] * 3
+    unknown = [window(reason, prediction_error={"draft": 0.1, "torque": share}) for share in (0.2, 0.31, 0.9)]
     text = summary_of(unknown, "a log", 0, Counter())
     assert f"    3 invalid: {reason}\n" in text
     assert says is None or says in text
@@ -100,7 +100,7 @@ def test_each_reason_has_its_advice(reason, says):
 
 
 def test_a_draft_about_zero_has_no_share():
-    windows = [window("ambiguous", Status.NOT_EXCITED, excitation=Excitation(3.0, 160.0, 0.02, 0.01))]
+    windows = [window("not_excited", Status.NOT_EXCITED, excitation=Excitation(3.0, 160.0, 0.02, 0.01))]
     text = summary_of(windows, "a log", None, Counter())
     assert "vary the load more: the draft was 3 ± 160 N, slip was 2.0 ± 1.0 %" in text
 
@@ -120,7 +120,7 @@ def test_one_cell_for_two_wheels_is_named_where_the_model_does_not_fit(tmp_path)
 
 
 def test_a_draft_that_never_is_is_not_said_to_have_moved():
-    nothing = window("ambiguous", Status.NOT_EXCITED, excitation=Excitation(0.0, 0.0, 0.2, 0.05))
+    nothing = window("not_excited", Status.NOT_EXCITED, excitation=Excitation(0.0, 0.0, 0.2, 0.05))
     text = summary_of([nothing], "a drive", None, Counter())
     assert "vary the load more: slip was 20.0 ± 5.0 %" in text
 

@@ -717,11 +717,14 @@ class Estimator(_Section):
     max_bearing_std: PositiveFloat = 0.10
     """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
     that carries load."""
+    max_draft_std: PositiveFloat = 0.25
+    """Relative std of the largest draft up to which a window of a vehicle counts as excited."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
-    counts as excited."""
-    max_chi2: PositiveFloat = 1.1
-    """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
+    of a test rig counts as excited, and up to which a window shows the soil's strength to the warning."""
+    max_prediction_error: PositiveFloat = 0.25
+    """Error of the torque or pull that the model predicts for data it has not seen, as a share of what is there, above
+    which a window is `model_mismatch`."""
     search_rate: NonNegativeFloat = 4.0
     """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
     the model describes take 1 to 3 in all (field and simulated drives)."""

@@ -100,6 +100,23 @@ def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
     return _with_instrumentation(rig, config, computed) if measured else rig
 
 
+def with_disengaged(config: Config, rig: Rig, apart: NDArray[np.bool_]) -> Rig:
+    """Return the rig while some of its wheels (W,) are disengaged: they roll freely, and the channels stay in place."""
+    if rig.instrumentation is None or not apart.any():
+        return rig
+    wheels = [w.model_copy(update={"driven": w.driven and not off}) for w, off in zip(config.wheel, apart, strict=True)]
+    free = rig_of(config.model_copy(update={"wheel": wheels}), rig.options)
+    assert free.instrumentation is not None
+    rows: dict[str, Any] = {
+        quantity: tuple(
+            row._replace(at=rig.names[quantity].index(row.name)) if row.kind == "channel" else row
+            for row in getattr(free.instrumentation, quantity)
+        )
+        for quantity in ("torque", "speed", "load")
+    }
+    return replace(free, names=rig.names, instrumentation=replace(free.instrumentation, **rows))
+
+
 def _torque_is_measured(config: Config) -> bool:
     return any(w.torque is not None for w in config.wheel) or any(a.torque is not None for a in config.axle)
 

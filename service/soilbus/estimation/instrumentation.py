@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.window import Rig, Window, steady, zero_if_unknown
+from soilbus.estimation.window import Rig, Window, pairs, steady, zero_if_unknown
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 
 __all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "unknown_draft", "with_speeds"]
@@ -259,6 +259,42 @@ def completed(window: Window, rig: Rig) -> Window:
         known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
         variance[quantity] = _combined(known, inverse**2)
     return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
+
+
+def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
+    """Return a window that was completed for a rig, completed for another one with the same channels."""
+    given, observations = rig.instrumentation, window.observations
+    if other is rig or given is None or observations is None:
+        return window
+    W, variance, raw = len(rig.wheels), dict(window.variance), dict[str, Any]()
+    columns = {
+        "torque": (observations.torque, observations.torque_var),
+        "load": (observations.value[:, :W], observations.variance[:, :W]),
+        "speed": (observations.value[:, W : 2 * W], observations.variance[:, W : 2 * W]),
+    }
+    for quantity, (values, variances) in columns.items():
+        raw[quantity], variance[quantity] = (np.full(values.shape, np.nan) for _ in range(2))
+        for i, row in enumerate(getattr(given, quantity)):
+            if row.kind == "channel":
+                raw[quantity][:, row.at], variance[quantity][:, row.at] = values[:, i], variances[:, i]
+    return completed(replace(window, variance=variance, observations=None, **raw), other)
+
+
+def straightened(window: Window, rig: Rig) -> Window:
+    """Return a completed window with the wheel speeds that give each wheel its own slip at the vehicle's ground speed.
+
+    On a curve at yaw rate q a wheel half a track to the left moves over the ground at V - q B / 2.
+    """
+    yaw = zero_if_unknown(window.yaw_rate)
+    if rig.track is None or rig.chassis is None or not yaw.any():
+        return window
+    left, right = pairs(rig)
+    own = np.repeat(window.ground_speed[:, None], len(rig.wheels), axis=1)
+    own[:, left] -= yaw[:, None] * rig.track / 2.0
+    own[:, right] += yaw[:, None] * rig.track / 2.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where(own > 0.0, window.ground_speed[:, None] / own, 1.0)
+    return with_speeds(window, rig, window.speed * np.where(np.isfinite(scale), scale, 1.0))
 
 
 def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:

@@ -403,7 +403,7 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
         return
     scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, lag // 2, options)
     wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
-    if not wrong.any():
+    if not lasts(wrong, data.sustained):
         return
     factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
     if _jumps(data):
