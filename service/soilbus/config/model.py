@@ -725,6 +725,9 @@ class Estimator(_Section):
     max_prediction_error: PositiveFloat = 0.25
     """Error of the torque or pull that the model predicts for data it has not seen, as a share of what is there, above
     which a window is `model_mismatch`."""
+    max_gain_error: PositiveFloat = 6.0
+    """Gain error of a sensor, in sd of what is configured of it, above which a window is `model_mismatch`: sound
+    multibody drives end at 5.3, those with a wrong weight or draft reach 9 to 20."""
     search_rate: NonNegativeFloat = 4.0
     """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
     the model describes take 1 to 3 in all (field and simulated drives)."""

@@ -201,8 +201,8 @@ class VarianceOptions:
     """Length of a block [s]: an axle bounces at 1.5 to 3 Hz, so that a second holds whole cycles of it."""
     memory: float = 30.0
     """Windows [1] over which factors are averaged, one a hop: half a minute of the same ground."""
-    least: float = 0.1
-    """Least factor on a variance [1]: sensors three times as good as their data sheets say."""
+    least: float = 0.25
+    """Least factor on a variance [1]: sensors twice as good as their data sheets say."""
     most: float = 400.0
     """Largest factor on a variance [1]: twenty times the sd of a data sheet, as loads that shake by 12 % have beside
     cells of 0.8 %."""

@@ -421,7 +421,7 @@ class WindowEstimator:
         failure = self._failure(tracked)
         if fit is None or failure is not None:
             return Status.INVALID, "no_convergence"
-        if tracked.mismatch or self._predictions.error() > self._settings.max_prediction_error:
+        if tracked.mismatch or self._contradicts(fit):
             return Status.DEGRADED, self._mismatch
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
@@ -430,6 +430,13 @@ class WindowEstimator:
         if lacks := lacking(fit, self._driven_rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
+
+    def _contradicts(self, fit: Fit) -> bool:
+        """Whether new data are far from their prediction, or a sensor's gain is far from what is configured of it."""
+        sensors = np.asarray(self._gain_std)
+        gains = np.abs(fit.gains[: len(sensors)])
+        too_far = bool((gains > self._settings.max_gain_error * sensors).any())
+        return too_far or self._predictions.error() > self._settings.max_prediction_error
 
     def _shows_strength(self, fit: Fit) -> bool:
         """Whether the window determines tan phi."""
