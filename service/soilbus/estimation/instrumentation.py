@@ -280,12 +280,12 @@ def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
     return completed(replace(window, variance=variance, observations=None, **raw), other)
 
 
-def straightened(window: Window, rig: Rig) -> Window:
+def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
     """Return a completed window with the wheel speeds that give each wheel its own slip at the vehicle's ground speed.
 
-    On a curve at yaw rate q a wheel half a track to the left moves over the ground at V - q B / 2.
+    On a curve at yaw rate q (N,) [rad/s] a wheel half a track to the left moves over the ground at V - q B / 2.
     """
-    yaw = zero_if_unknown(window.yaw_rate)
+    yaw = zero_if_unknown(yaw_rate)
     if rig.track is None or rig.chassis is None or not yaw.any():
         return window
     left, right = pairs(rig)
