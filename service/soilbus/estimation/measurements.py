@@ -146,6 +146,8 @@ class Measurements:
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
+        if rig.lengths is not None:
+            load, load_var = steady_loads(load, load_var, usable & (rig.lengths > 0.0))
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
@@ -413,6 +415,21 @@ class Curves:
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])
+
+
+def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return loads (N, W) and variances, with the mean in place of a track's loads that vary no more than their noise.
+
+    A track presses evenly, so that nothing but its load tells c and tan phi apart.  Gauss-Newton takes noise in a
+    regressor for information (Neyman & Scott 1948, Econometrica 16:1), and would tell them apart by it.
+    """
+    load, variance = load.copy(), variance.copy()
+    for w in range(load.shape[1]):
+        on = tracks[:, w] & (variance[:, w] > 0.0)
+        n = int(on.sum())
+        if n > 1 and load[on, w].var() < 2.0 * variance[on, w].mean():  # half of it is noise
+            load[on, w], variance[on, w] = load[on, w].mean(), variance[on, w].mean() / n
+    return load, variance
 
 
 def off_curve(t: Array, value: Array, variance: Array) -> Array:
