@@ -1,6 +1,7 @@
 """Prediction: how far new data are from what the windows before say of them, in plain units.
 
-    share = sqrt(sum of squares of the mean error of each second  /  sum of squares of what is predicted)
+    share = sqrt((sum of squares of the mean error of each second - variance of its noise)
+                 / sum of squares of what is predicted)
 
 The error is that of torque at measured loads and slips, and of the pull at measured draft, slope and acceleration.  No
 fit has seen these data.  Means over a second leave out what a machine that shakes does in an instant.
@@ -17,7 +18,7 @@ from soilbus.estimation.variance_components import block_sums
 
 
 class Share(NamedTuple):
-    """Sums of squares of errors and of what was predicted, in the units of the channel squared."""
+    """Sums of squares of errors beyond noise and of what was predicted, in the units of the channel squared."""
 
     error: float
     size: float
@@ -43,10 +44,15 @@ def prediction_shares(problem: ObservationModel, at: Linearisation, since: float
     known = known[:, : W + 1]
     thrust = np.abs(problem.wheel_torque[new] / problem.rig.radius).sum(axis=1)
     size = np.column_stack([np.where(known[:, :W], problem.torque[new], 0.0), np.where(known[:, W], thrust, 0.0)])
-    errors, sizes, counts = (block_sums(values, t, block) for values in (residual, size, known.astype(float)))
+    variance, row_var = (v[new] for v in problem.variances(np.zeros(len(problem.gain_std))))
+    noise = np.where(known, (row_var + np.einsum("nml,nl->nm", at.by_latents[new] ** 2, variance))[:, : W + 1], 0.0)
+    sums = (block_sums(values, t, block) for values in (residual, noise, size, known.astype(float)))
+    errors, noises, sizes, counts = sums
     counts = np.maximum(counts, 1.0)
-    squares = (errors / counts) ** 2, (sizes / counts) ** 2
+    squares = (errors**2 - noises) / counts**2, (sizes / counts) ** 2
     parts = {"torque": slice(W), "draft": slice(W, W + 1)}
     return {
-        name: Share(*(float(s[:, part].sum()) for s in squares)) for name, part in parts.items() if known[:, part].any()
+        name: Share(*(max(float(s[:, part].sum()), 0.0) for s in squares))
+        for name, part in parts.items()
+        if known[:, part].any()
     }

@@ -30,6 +30,8 @@ KINDS = {
     "load": ("load",), "speed": ("speed",), "ground_speed": ("ground_speed",), "computed_load": (),
 }  # fmt: skip
 """Quantities whose variance each factor scales; that of loads which no cell measures is of the rig."""
+RESPONSES = ("torque", "draft", "sinkage")
+"""Kinds that the model computes from loads and speeds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +72,12 @@ class VarianceComponents:
 
     def after(self, found: Mapping[str, float], whole: bool = False) -> VarianceComponents:
         """Return the components after a window whose corrections are `found` times those expected; whole: replaced."""
-        low, high = self.options.least, self.options.most
         share = 1.0 if whole else 1.0 / (min(self.weight, self.options.memory) + 1.0)
         factor = dict(self.factor)
         for kind, ratio in found.items():
             old = factor.get(kind, 1.0)
-            factor[kind] = min(max(old * ratio**share, low), high)
+            least = self.options.least if kind in RESPONSES else 1.0
+            factor[kind] = min(max(old * ratio**share, least), self.options.most)
         return replace(self, factor=factor, weight=self.weight + 1.0)
 
 
