@@ -145,7 +145,6 @@ class Measurements:
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
-        load, load_var = steady_loads(load, load_var, usable)
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
@@ -412,25 +411,6 @@ class Curves:
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])
-
-
-def steady_loads(load: Array, variance: Array, usable: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return loads (N, W) and their variances, with the mean in place of a wheel's loads that vary no more than noise.
-
-    Gauss-Newton takes noise in a regressor for information: a load that hardly varies would seem to tell c and tan phi
-    apart (Neyman & Scott 1948, Econometrica 16:1).
-    """
-    load, variance = load.copy(), variance.copy()
-    for w in range(load.shape[1]):
-        on = usable[:, w] & (variance[:, w] > 0.0)
-        n = int(on.sum())
-        if n > 1 and load[on, w].var() < STEADY_RATIO * variance[on, w].mean():
-            load[on, w], variance[on, w] = load[on, w].mean(), variance[on, w].mean() / n
-    return load, variance
-
-
-STEADY_RATIO = 2.0
-"""Variance of loads over that of their noise [1] below which they count as steady: half of it is noise."""
 
 
 def off_curve(t: Array, value: Array, variance: Array) -> Array:
