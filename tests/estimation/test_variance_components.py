@@ -84,11 +84,17 @@ def test_factors_are_geometric_means_within_their_bounds():
     options = replace(ESTIMATOR.variance, memory=4.0, least=0.5, most=8.0)
     components = VarianceComponents(options)
     for ratio in (2.0, 0.5, 2.0):
-        components = components.after({"load": ratio})
+        components = components.after({"draft": ratio})
     assert components.weight == 3.0
-    assert components.factor["load"] == pytest.approx(2.0 * 0.5 ** (1 / 2) * 2.0 ** (1 / 3))
-    assert components.after({"load": 1e9}, whole=True).factor["load"] == 8.0
-    assert components.after({"load": 1e-9}, whole=True).factor["load"] == 0.5
+    assert components.factor["draft"] == pytest.approx(2.0 * 0.5 ** (1 / 2) * 2.0 ** (1 / 3))
+    assert components.after({"draft": 1e9}, whole=True).factor["draft"] == 8.0
+    assert components.after({"draft": 1e-9}, whole=True).factor["draft"] == 0.5
+
+
+@pytest.mark.parametrize("kind", ["load", "computed_load", "speed", "ground_speed"])
+def test_a_regressor_is_never_better_than_its_data_sheet(kind):
+    components = VarianceComponents(ESTIMATOR.variance).after({kind: 1e-9}, whole=True)
+    assert components.factor[kind] == 1.0
 
 
 def test_blocks_are_those_of_the_clock_and_empty_ones_are_left_out():
