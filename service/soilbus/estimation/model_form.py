@@ -40,8 +40,9 @@ SIDE = np.array([-1.0, 1.0, 1.0, 1.0])
 """Which way the literature's forms lie from the configured one: the peak nearer to the axle, the exit behind it."""
 OF_SQUARE = np.array([1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0, 1.0 / 4.0])
 """Variance over the square of the range: even between its ends (1/12), or either end as likely (1/4: a shear law)."""
-OPEN = 0.5
-"""Probability that the contact is of another form than the configured one, which is itself a published form."""
+OPEN = 0.8
+"""Probability that the contact is of another form than the configured one, which is itself a published form.  By
+another wheel's formula, without sinkage sensors, 34 of 36 intervals of pressure hold; with 0.5 only 29."""
 _SOIL = len(PARAMETERS)
 
 
