@@ -113,7 +113,7 @@ def test_a_soil_that_drifts_as_configured_is_covered_where_the_wheels_are_now():
 
 
 @pytest.mark.parametrize("seed", [901, 905])
-def test_no_valid_window_on_a_soil_that_drifts_much_is_wrong(seed):
+def test_intervals_of_valid_windows_hold_on_a_soil_that_drifts_much(seed):
     config = reference_configuration()
     scenario = Scenario(
         40.0, drifting(40.0, 0.1, seed), Swing(SPEED, SPEED + 1e-6), slip=Swing(0.05, 0.40), transition=STEP
@@ -126,4 +126,5 @@ def test_no_valid_window_on_a_soil_that_drifts_much_is_wrong(seed):
             place = np.interp(end, recording.truth["t"], recording.truth["distance"])
             here = Soil(*map(float, soil_along(scenario.soils, np.array(place), STEP)))
             away.append(errors(result.posterior, here))
-    assert np.abs(away).max(initial=0.0) < 3.0
+    assert len(away) > 15
+    assert (np.mean(np.abs(away) < 1.96, axis=0) >= 0.9).all()
