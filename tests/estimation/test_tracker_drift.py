@@ -112,19 +112,18 @@ def test_a_soil_that_drifts_as_configured_is_covered_where_the_wheels_are_now():
     assert np.all(np.mean(np.abs(away) < 1.96, axis=0) > 0.9)
 
 
-@pytest.mark.parametrize("seed", [901, 905])
-def test_intervals_of_valid_windows_hold_on_a_soil_that_drifts_much(seed):
-    config = reference_configuration()
-    scenario = Scenario(
-        40.0, drifting(40.0, 0.1, seed), Swing(SPEED, SPEED + 1e-6), slip=Swing(0.05, 0.40), transition=STEP
-    )
-    recording = simulate(config, scenario, seed)
-    estimator, away = WindowEstimator(config), []
-    for window, end in windows(config, recording):
-        result = estimator.estimate(task_of(window, end, config, index=round(end - 10.0))).result
-        if result.status is Status.VALID:
-            place = np.interp(end, recording.truth["t"], recording.truth["distance"])
-            here = Soil(*map(float, soil_along(scenario.soils, np.array(place), STEP)))
-            away.append(errors(result.posterior, here))
-    assert len(away) > 15
+def test_intervals_of_valid_windows_hold_on_soils_that_drift_much():
+    config, away = reference_configuration(), []
+    for seed in (901, 905):
+        scenario = Scenario(
+            40.0, drifting(40.0, 0.1, seed), Swing(SPEED, SPEED + 1e-6), slip=Swing(0.05, 0.40), transition=STEP
+        )
+        recording, estimator = simulate(config, scenario, seed), WindowEstimator(config)
+        for window, end in windows(config, recording):
+            result = estimator.estimate(task_of(window, end, config, index=round(end - 10.0))).result
+            if result.status is Status.VALID:
+                place = np.interp(end, recording.truth["t"], recording.truth["distance"])
+                here = Soil(*map(float, soil_along(scenario.soils, np.array(place), STEP)))
+                away.append(errors(result.posterior, here))
+    assert len(away) > 30
     assert (np.mean(np.abs(away) < 1.96, axis=0) >= 0.9).all()
