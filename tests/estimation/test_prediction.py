@@ -25,15 +25,10 @@ def test_shares_are_those_of_forces_at_measured_loads_and_slips(predicting, simu
 
     new = case.window.t > SINCE
     window, rig = case.window.rows(np.flatnonzero(new)), case.rig
-
-    def forces(load, speed, ground):
-        """Pull and torque of each wheel."""
-        slip = 1.0 - ground[:, None] / (rig.radius * speed)
-        state = state_on(soil, np.full(load.shape, 0.2), slip, rig.radius, rig.width)
-        return wheel_forces(state._replace(entry_angle=entry_angle_for_load(load, state, MODEL)), MODEL)[1:]
-
-    measured = window.load, window.speed, window.ground_speed
-    pull, torque = forces(*measured)
+    slip = 1.0 - window.ground_speed[:, None] / (rig.radius * window.speed)
+    state = state_on(soil, np.full(window.load.shape, 0.2), slip, rig.radius, rig.width)
+    state = state._replace(entry_angle=entry_angle_for_load(window.load, state, MODEL))
+    _, pull, torque = wheel_forces(state, MODEL)
     demand = window.draft + rig.chassis.mass * (GRAVITY * np.sin(window.pitch) + window.acceleration)
 
     def of_seconds(values: np.ndarray) -> float:
@@ -41,29 +36,17 @@ def test_shares_are_those_of_forces_at_measured_loads_and_slips(predicting, simu
         second = np.floor(window.t)
         return sum(float((values[second == s].mean(axis=0) ** 2).sum()) for s in np.unique(second))
 
-    def noise_of_seconds(variance: np.ndarray) -> float:
-        """Sum of the variances of the means of each second."""
+    def noise_of_seconds(values: np.ndarray) -> float:
+        """Sum of the variances of the means of each second, by the scatter within it."""
         second = np.floor(window.t)
-        return sum(float(variance[second == s].mean(axis=0).sum() / (second == s).sum()) for s in np.unique(second))
+        parts = (values[second == s] for s in np.unique(second))
+        return sum(float(part.var(axis=0, ddof=1).sum() / len(part)) for part in parts)
 
-    var = window.variance
-    of_torque = np.broadcast_to(var["torque"], torque.shape).copy()
-    weight = rig.chassis.mass * GRAVITY
-    of_pull = var["draft"] + (weight * np.cos(window.pitch)) ** 2 * var["pitch"]
-    of_pull = of_pull + rig.chassis.mass**2 * var["acceleration"]
-    for i, quantity in enumerate(("load", "speed", "ground_speed")):
-        sd = np.sqrt(var[quantity])
-        more = [x + 0.1 * sd if k == i else x for k, x in enumerate(measured)]
-        by_pull, by_torque = (
-            10.0 * (after - before) for after, before in zip(forces(*more), (pull, torque), strict=True)
-        )
-        of_torque += by_torque**2
-        by_pull = by_pull.sum(axis=1) ** 2 if quantity == "ground_speed" else (by_pull**2).sum(axis=1)
-        of_pull = of_pull + by_pull
     thrust = np.abs(window.torque / rig.radius).sum(axis=1)
+    off, missing = window.torque - torque, demand - pull.sum(axis=1)
     expected = {
-        "torque": (of_seconds(window.torque - torque) - noise_of_seconds(of_torque), of_seconds(window.torque)),
-        "draft": (of_seconds(demand - pull.sum(axis=1)) - noise_of_seconds(of_pull), of_seconds(thrust)),
+        "torque": (of_seconds(off) - noise_of_seconds(off), of_seconds(window.torque)),
+        "draft": (of_seconds(missing) - noise_of_seconds(missing), of_seconds(thrust)),
     }
     assert set(shares) == set(expected)
     for channel, (error, size) in expected.items():

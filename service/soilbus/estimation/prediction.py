@@ -1,6 +1,6 @@
 """Prediction: how far new data are from what the windows before say of them, in plain units.
 
-    share = sqrt((sum of squares of the mean error of each second - variance of its noise)
+    share = sqrt((sum of squares of the mean error of each second - variance of that mean by the scatter within it)
                  / sum of squares of what is predicted)
 
 The error is that of torque at measured loads and slips, and of the pull at measured draft, slope and acceleration.  No
@@ -44,15 +44,14 @@ def prediction_shares(problem: ObservationModel, at: Linearisation, since: float
     known = known[:, : W + 1]
     thrust = np.abs(problem.wheel_torque[new] / problem.rig.radius).sum(axis=1)
     size = np.column_stack([np.where(known[:, :W], problem.torque[new], 0.0), np.where(known[:, W], thrust, 0.0)])
-    variance, row_var = (v[new] for v in problem.variances(np.zeros(len(problem.gain_std))))
-    noise = np.where(known, (row_var + np.einsum("nml,nl->nm", at.by_latents[new] ** 2, variance))[:, : W + 1], 0.0)
-    sums = (block_sums(values, t, block) for values in (residual, noise, size, known.astype(float)))
-    errors, noises, sizes, counts = sums
+    sums = (block_sums(values, t, block) for values in (residual, residual**2, size, known.astype(float)))
+    errors, squares, sizes, counts = sums
     counts = np.maximum(counts, 1.0)
-    squares = (errors**2 - noises) / counts**2, (sizes / counts) ** 2
+    noise = np.maximum(squares - errors**2 / counts, 0.0) / np.maximum(counts - 1.0, 1.0)  # of an instant
+    found = (errors / counts) ** 2 - noise / counts, (sizes / counts) ** 2
     parts = {"torque": slice(W), "draft": slice(W, W + 1)}
     return {
-        name: Share(*(max(float(s[:, part].sum()), 0.0) for s in squares))
+        name: Share(*(max(float(s[:, part].sum()), 0.0) for s in found))
         for name, part in parts.items()
         if known[:, part].any()
     }
