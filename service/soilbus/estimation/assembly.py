@@ -74,8 +74,9 @@ def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
     slip, computed = noise.pop("slip"), noise.pop("computed_load")
     noise["differential_lock"] = SensorNoise(absolute=1.0)
-    if of_table:  # its speeds are computed from the slip, see tables.py
+    if of_table:  # its speeds are computed from the slip, see tables.py; a few steady rows have the noise that they say
         noise |= {"speed": SensorNoise(), "ground_speed": slip}
+        options = replace(options, variance=replace(options.variance, least=1.0, most=1.0))
     rig = Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),

@@ -67,6 +67,7 @@ REASONS = {
     "no_frames": ("nothing on the bus", "Check the CAN connection"),
     "standstill": ("standing still", "Drive on to measure"),
     "not_excited": ("load or slip hardly varies", "Go carefully, vary the load"),
+    "ambiguous": ("several soils fit", "Go carefully, vary the load"),
     "turning": ("turning", "Drive straight to measure"),
     "input_missing": ("an input never came", "Check the sensors"),
     "input_stale": ("an input stopped", "Check the sensors"),
