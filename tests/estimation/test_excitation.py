@@ -7,18 +7,20 @@ import pytest
 from scipy.stats import binom, chi2
 
 from soilbus.decision.traversability import State, Status
-from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.simulator.drivetrain import drivetrain_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
+from soilbus.trials.draft_trials import true_largest_draft
 from soilbus.trials.draws import prior_about
 from tests.lab import driven_windows
 from tests.lab.driven_windows import tasks
 
-STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
+STILL, LEANING, ROCKING = Swing(0.0, 1e-9), Swing(-0.3, 0.3), Swing(-0.3, 0.3, 0.2, 0.4)
 SLIPS = (0.05, 0.1, 0.2, 0.35)
 DRIVES = 16
 Z_REF, B_REF = 0.02, 0.3
@@ -87,36 +89,64 @@ def said(soil, slip, shift, sinkage=True, overrides=(), seconds=10.0, seed=1):
     return WindowEstimator(config).solve(next(tasks(config, scenario, seed, "none" if sinkage else "sinkage")))
 
 
+def relative_std(estimate):
+    return estimate.std / estimate.value
+
+
+def largest_draft(soil):
+    """True largest draft [N] of the reference tractor on the level, by the simulator's equilibrium."""
+    config = reference_configuration()
+    limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
+    return true_largest_draft(
+        SOILS[soil], rig_of(config), limit, config.traversability.max_slip, model_of(config), np.inf,
+        drivetrain_of(config),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "dry_sand"])
 def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
-    short = said(soil, driven_windows.EXCITED, STILL, sinkage=False, seconds=5.0)
-    assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
-    assert short.traversability.state is not State.GO
-    varied = said(soil, driven_windows.EXCITED, LEANING, sinkage=False, seconds=5.0)
-    assert varied.bearing.std / varied.bearing.value < 0.8 * short.bearing.std / short.bearing.value
+    narrower = []
+    for seed in range(1, 7):
+        short = said(soil, driven_windows.EXCITED, STILL, sinkage=False, seconds=5.0, seed=seed)
+        assert short.status is Status.NOT_EXCITED
+        assert "load_range" in short.reason.split()
+        assert short.traversability.state is not State.GO
+        assert np.abs(deviations(short.posterior, soil)).max() < 3.0
+        varied = said(soil, driven_windows.EXCITED, ROCKING, sinkage=False, seconds=5.0, seed=seed)
+        assert np.abs(deviations(varied.posterior, soil)).max() < 3.0
+        narrower.append(relative_std(varied.bearing) / relative_std(short.bearing))
+    assert max(narrower) < 1.0
+    assert np.mean(narrower) < 0.8
 
 
-def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else():
-    strict = ["estimator.max_bearing_std=0.05"]
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else(seed):
+    strict = ["estimator.max_bearing_std=0.08"]
     short, varied = (
-        said("dry_sand", driven_windows.EXCITED, shift, overrides=strict, seconds=2.0) for shift in (STILL, LEANING)
+        said("dry_sand", driven_windows.EXCITED, shift, overrides=strict, seconds=2.0, seed=seed)
+        for shift in (STILL, LEANING)
     )
     assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
     assert (varied.status, varied.reason) == (Status.VALID, "none")
 
 
+@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("soil", ["loam", "lete_sand", "sandy_loam_23_michigan"])
-def test_varied_loads_with_constant_slip_lack_a_range_of_slips(soil):
-    strict = ["estimator.max_tan_phi_std=0.05"]
-    still = said(soil, driven_windows.constant(0.05), LEANING, overrides=strict)
+def test_varied_loads_with_constant_slip_lack_a_range_of_slips(soil, seed):
+    strict = ["estimator.max_draft_std=0.11"]
+    still = said(soil, driven_windows.constant(0.05), LEANING, overrides=strict, seed=seed)
     assert (still.status, still.reason) == (Status.NOT_EXCITED, "not_excited slip_range")
-    varied = said(soil, driven_windows.EXCITED, LEANING, overrides=strict)
-    assert varied.posterior.tan_phi().std < 0.6 * still.posterior.tan_phi().std
+    varied = said(soil, driven_windows.EXCITED, LEANING, overrides=strict, seed=seed)
+    assert (varied.status, varied.reason) == (Status.VALID, "none")
+    assert varied.posterior.tan_phi().std < 0.7 * still.posterior.tan_phi().std
+    for result in (still, varied):
+        draft = result.traversability.max_draft
+        assert abs(draft.value - largest_draft(soil)) < NORMAL_95 * draft.std
 
 
 @pytest.mark.parametrize("soil", ["wet_clay", "dry_sand", "clayey_soil_38"])
 def test_both_are_named_where_both_are_missing(soil):
-    strict = ["estimator.max_tan_phi_std=0.03", "estimator.max_bearing_std=0.01"]
+    strict = ["estimator.max_draft_std=0.03", "estimator.max_bearing_std=0.01"]
     result = said(soil, driven_windows.constant(0.05), STILL, sinkage=False, overrides=strict, seconds=2.0)
     assert (result.status, result.reason) == (Status.NOT_EXCITED, "not_excited load_range slip_range")
 

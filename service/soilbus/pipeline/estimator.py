@@ -258,8 +258,11 @@ class WindowEstimator:
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         result = window.result
-        if result.status is Status.VALID and not draft_is_known(decision.max_draft, self._settings):
-            result = replace(result, status=Status.NOT_EXCITED, reason="not_excited slip_range")
+        if result.reason in ("none", "not_excited load_range") and not draft_is_known(
+            decision.max_draft, self._settings
+        ):
+            lacks = [*result.reason.split()[1:], "slip_range"]
+            result = replace(result, status=Status.NOT_EXCITED, reason=" ".join(["not_excited", *lacks]))
             window = replace(window, result=result)
         return replace(result, traversability=self._with_state(decision, window))
 
