@@ -155,15 +155,16 @@ def test_an_added_covariance_adds_up_and_never_exceeds_the_prior():
 
 
 def test_a_posterior_over_two_forms_of_the_contact_has_their_mean_and_covariance():
-    """Against draws: the configured form as likely as an open one, whose parameters are Gaussian."""
+    """Against draws: of the configured form, or as often as the shift of the mean says of Gaussian form parameters."""
     rng = np.random.default_rng(6)
     prior = SoilPrior(np.ones(6), np.array([2.0, 1.5, 0.0, 1.4, 1.6, 1.3]))
     root = 0.05 * rng.standard_normal((6, 6)) * (prior.log_std > 0.0)[:, None]
     by_form = 0.5 * rng.standard_normal((9, 4)) * np.concatenate([prior.log_std > 0.0, np.ones(3)])[:, None]
     spread, mean = 0.1 * rng.standard_normal((4, 4)), np.array([-0.2, 0.1, 0.15, 0.3])
     form = FormPosterior(by_form, mean, spread @ spread.T)
-    n = 400_000
-    of_form = np.where(rng.random(n) < 0.5, 0.0, mean[:, None] + spread @ rng.standard_normal((4, n)))
+    n, is_open = 400_000, form.log_shift[0] / (by_form[0] @ mean)
+    assert 0.0 < is_open < 1.0
+    of_form = np.where(rng.random(n) > is_open, 0.0, mean[:, None] + spread @ rng.standard_normal((4, n)))
     drawn = root @ rng.standard_normal((6, n)) + by_form[:6] @ of_form
     found = Posterior(Soil(*np.ones(6)), root @ root.T).with_added_covariance(
         form.log_covariance, prior, form.log_shift

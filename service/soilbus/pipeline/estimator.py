@@ -421,9 +421,10 @@ class WindowEstimator:
                 return Status.INVALID, "input_stale " + " ".join(task.poor)
             is_short = tracked.reason is Reason.TOO_FEW_DATA
             return (Status.NOT_EXCITED, "not_excited few_bins") if is_short else (Status.INVALID, "no_convergence")
-        failure = self._failure(tracked)
-        if fit is None or failure is not None:
+        if self._failure(tracked) is not None:
             return Status.INVALID, "no_convergence"
+        if fit is None or not fit.converged:
+            return Status.INVALID, self._mismatch
         if tracked.mismatch or self._contradicts(fit):
             return Status.DEGRADED, self._mismatch
         if task.poor:
@@ -455,9 +456,9 @@ class WindowEstimator:
     def _failure(self, tracked: TrackerOutput) -> str | None:
         """Kind of failure of a solve: not_finite or no_convergence; None for none."""
         fit = tracked.fit
-        if not tracked.mismatch or (fit is not None and self._tracker.is_of_several_soils(fit)):
-            return None
-        return "no_convergence" if fit is not None or tracked.search_ended else "not_finite"
+        if fit is None:
+            return "not_finite" if tracked.mismatch and not tracked.search_ended else None
+        return None if fit.converged or self._tracker.is_of_several_soils(fit) else "no_convergence"
 
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:
