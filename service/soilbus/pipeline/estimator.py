@@ -258,7 +258,7 @@ class WindowEstimator:
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         result = window.result
-        if result.status is Status.VALID and not draft_is_known(decision.max_draft, self._settings):
+        if result.status is Status.VALID and not draft_is_known(decision.max_draft, window.rig, self._settings):
             result = replace(result, status=Status.NOT_EXCITED, reason="not_excited slip_range")
             window = replace(window, result=result)
         return replace(result, traversability=self._with_state(decision, window))
