@@ -718,7 +718,8 @@ class Estimator(_Section):
     """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
     that carries load."""
     max_draft_std: PositiveFloat = 0.25
-    """Relative std of the largest draft up to which a window of a vehicle counts as excited."""
+    """Std of the largest draft up to which a window of a vehicle counts as excited, as a share of this draft's size or,
+    where that is more, of a tenth of the weight."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
     of a test rig counts as excited, and up to which a window shows the soil's strength to the warning."""

@@ -3,7 +3,8 @@
     excitation   sd of draft and slip = sqrt(max(sample variance - mean noise variance, 0)):  load determines the
                  bearing modulus, slip the shear strength
     load_range   lacks where  std p(z) > max_bearing_std p(z),   z: z_ref, within the depths that carry load
-    slip_range   lacks where  std of the largest draft > max_draft_std of it; of a test rig where
+    slip_range   lacks where  std of the largest draft > max_draft_std max(|largest draft|, LEAST_DRAFT weight);
+                 of a test rig where
                  std tan phi > max_tan_phi_std tan phi  and  std tau > max_tan_phi_std tau,
                  tau = c + p tan phi at the contact's own pressure p = W / (b l)
 
@@ -24,7 +25,7 @@ from soilbus.config.model import Estimator
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window
-from soilbus.terra.vehicle import slip_ratio
+from soilbus.terra.vehicle import GRAVITY, slip_ratio
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, sinkage
 
 __all__ = [
@@ -36,6 +37,10 @@ __all__ = [
     "loaded_depths",
     "sinkage_range",
 ]
+
+LEAST_DRAFT = 0.1
+"""Draft [1], over the weight, below which a relative error says little: a machine that can pull nothing is known as
+well as one that can.  A tenth is what wheels resist on soft fields (0.05 to 0.1, Wong 2008, fig. 2.60)."""
 
 
 class Excitation(NamedTuple):
@@ -87,9 +92,12 @@ def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
     return [name for name, is_lacking in lacks.items() if is_lacking]
 
 
-def draft_is_known(draft: Estimate | None, settings: Estimator) -> bool:
+def draft_is_known(draft: Estimate | None, rig: Rig, settings: Estimator) -> bool:
     """Return whether the largest draft is known to `max_draft_std`; True where there is none to know."""
-    return draft is None or not _is_wide(draft, settings.max_draft_std)
+    if draft is None or rig.chassis is None:
+        return True
+    size = max(abs(draft.value), LEAST_DRAFT * rig.chassis.mass * GRAVITY)
+    return draft.std <= settings.max_draft_std * size
 
 
 def loaded_depths(fit: Fit, rig: Rig) -> tuple[float, float]:

@@ -259,7 +259,7 @@ class WindowEstimator:
         )  # fmt: skip
         result = window.result
         if result.reason in ("none", "not_excited load_range") and not draft_is_known(
-            decision.max_draft, self._settings
+            decision.max_draft, window.rig, self._settings
         ):
             lacks = [*result.reason.split()[1:], "slip_range"]
             result = replace(result, status=Status.NOT_EXCITED, reason=" ".join(["not_excited", *lacks]))
