@@ -209,8 +209,8 @@ FAULTS = {
     "motor 200 ms late": Fault(le.delayed(0.2, "McuFL"), BAD, lies("motor_speed.FL"), length=BORDER),
     "loads 1 s late": Fault(le.delayed(1.0, "AxleLoads"), BAD, "model_mismatch", length=BORDER),
     "draft 1 s late": Fault(le.delayed(1.0, "DrawbarPin"), BAD, "model_mismatch", length=BORDER),
-    "ground speed 1 s late": Fault(le.delayed(1.0, RADAR), BAD, lies("ground_speed", "acceleration")),
-    "attitude 1 s late": Fault(le.delayed(1.0, "Attitude"), BAD, lies("acceleration")),
+    "ground speed 1 s late": Fault(le.delayed(1.0, RADAR), BAD, "input_stale ground_speed"),
+    "attitude 1 s late": Fault(le.delayed(1.0, "Attitude"), BAD, "model_mismatch"),
     "speeds stamped 50 ms early": Fault(le.stamped_early(0.05, "WheelSpeeds"), GOOD, "none", "time_backwards"),
     "loads stamped 0.5 s early": Fault(
         le.stamped_early(0.5, "AxleLoads"), BAD, "input_stale load.FL load.FR load.RL load.RR", "time_backwards"
@@ -239,7 +239,9 @@ FAULTS = {
     ),
     "speed of another pulse wheel": Fault(le.scaled(1.3, SPEEDS[2]), BAD, lies("speed.RL")),
     "ground speed doubled": Fault(le.scaled(2.0, GROUND), BAD, lies("ground_speed")),
-    "ground speed halved": Fault(le.scaled(0.5, GROUND), BAD, lies("ground_speed"), length=BORDER),
+    "ground speed halved": Fault(
+        le.scaled(0.5, GROUND), BAD, lies("ground_speed", "acceleration"), length=BORDER + 8.0
+    ),
     "ground speed halved from the start": Fault(
         le.scaled(0.5, GROUND), BAD, lies("ground_speed", "acceleration"), since=FROM_THE_START, length=12.2
     ),
