@@ -153,11 +153,12 @@ def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
             assert result.mismatch
 
 
-def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
-    config = reference_configuration(["estimator.soil_drift=0.005"])  # what may drift by 3 % is soon forgotten
+@pytest.mark.parametrize("seed", [1, 2])
+def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said(seed):
+    config = reference_configuration(["estimator.soil_drift=0.0005"])  # what drifts is soon forgotten and ends wide
     scenario = Scenario(200.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     tracker = tracker_of(config)
-    results = [tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, 1))]
+    results = [tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, seed))]
     assert {r.state for r in results} == {TrackerState.STEADY}
     assert not any(r.mismatch for r in results)
     away = np.array([off(r, "loam") for r in results])
@@ -166,7 +167,7 @@ def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
     assert np.abs(away).max() < 3.5
     # The windows before add information: the last estimates have smaller sd than the first.
     std = [r.fit.posterior.bearing_pressure(Z_REF, B_REF).std for r in results]
-    assert np.median(std[-20:]) < 0.9 * np.median(std[:5])
+    assert np.median(std[-20:]) < 0.8 * np.median(std[:5])
 
 
 def test_a_window_that_fails_leaves_what_is_known_alone():
