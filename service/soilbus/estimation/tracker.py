@@ -501,7 +501,7 @@ class Tracker:
         two = None if change is None else self._two_soils(present, one, change)
         if two is not None:
             return two
-        if self.mismatch(one.fit) and self._budget.allows():
+        if (one.warm is None or self.mismatch(one.fit)) and self._budget.allows():
             one = self._another_soil(present, one if one.warm is None else self._searched(present))
         return one
 
@@ -576,11 +576,14 @@ class Tracker:
 
     def _another_soil(self, present: _Present, one: _Explanation) -> _Explanation:
         """The window as one soil, a new one where the prior of the present one conflicts with the data."""
-        if not (self.mismatch(one.fit) and self._posteriors):
+        if not self._posteriors:
             return one
         joint_prior = present.joint_prior.with_prior_soil(self._new_soil_prior)
-        other = self._search(present.problem, self._new_soil_prior, joint_prior)
-        if self.mismatch(other):
+        fit, other = one.fit, self._search(present.problem, self._new_soil_prior, joint_prior)
+        if other is None or self.mismatch(other):
+            return one
+        gain = math.inf if fit is None or self.mismatch(fit) else fit.neg2_log_evidence - other.neg2_log_evidence
+        if gain < self.options.significance:
             return one
         begin = float(present.problem.t[0])
         objective = Objective(present.problem, self._new_soil_prior, joint_prior)
