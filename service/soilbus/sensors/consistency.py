@@ -403,12 +403,12 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
         return
     scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, lag // 2, options)
     wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
+    if wrong.any() and _jumps(data):
+        yield "ground_speed"
+        return
     if not lasts(wrong, data.sustained):
         return
     factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
-    if _jumps(data):
-        yield "ground_speed"
-        return
     if not 1.0 - (1.0 - seen) / factor < -options.feigned_slip:
         yield "ground_speed"
     if not seen < -options.feigned_slip:
