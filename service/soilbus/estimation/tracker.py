@@ -651,9 +651,7 @@ class Tracker:
         if fit is None or not fit.converged:
             return fit
         form = self._form_posterior(objective, fit)
-        half = (
-            self.options.steady_drift * self.settings.drift / 2.0
-        )  # the end of a window is half of it from its middle
+        half = self.options.steady_drift * self.settings.drift / 2.0  # from a window's middle to its end
         directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(fit.mode.soil)
         mode = fit.mode.drifted(half**2 * (directions @ directions.T), np.zeros(len(fit.gains)))
         return replace(fit, mode=mode, form=form)
