@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 __all__ = [
     "ESTIMATOR",
+    "HELD",
     "EstimatorOptions",
     "MeasurementOptions",
     "PosteriorOptions",
@@ -191,6 +192,10 @@ class StandingOptions:
     """[s]: as `load`, and a filter against the hitch's vibration."""
     acceleration: float = 0.04
     """[s], as `load`."""
+
+
+HELD = StandingOptions(0.0, 0.0, StandingOptions().wheel_mass_share, 0.0, 0.0, 0.0, 0.0)
+"""None of them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import Fit, fit_window
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
-from soilbus.estimation.options import ESTIMATOR, StandingOptions
+from soilbus.estimation.options import ESTIMATOR, HELD
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -47,7 +47,7 @@ Each pass has the weights and the eliminated loads and speeds of the end of the 
 the last would be wasted. Four passes are the least that bring all six windows to the same end as ours."""
 RELATIVE_DIFFERENCE = 1e-5
 """Relative step of the finite differences. The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
-AT_REST = replace(ESTIMATOR, standing=StandingOptions(0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 0.0))
+AT_REST = replace(ESTIMATOR, standing=HELD)
 """The peer knows no relaxation, inertia and lateness."""
 
 
