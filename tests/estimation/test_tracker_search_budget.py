@@ -66,6 +66,16 @@ def test_what_is_well_again_is_soon_found(drive):
     assert healed <= first <= healed + 6
 
 
+def test_windows_that_no_soil_explains_say_nothing_of_the_sensors(drive):
+    """What is learned as noise from them hides a fault of the same size that comes later."""
+    estimator, sound, bad = WindowEstimator(CONFIG), WindowEstimator(CONFIG), 10
+    for i, task in enumerate(drive[: bad + 6]):
+        result, expected = estimator.solve(with_draft(task, -1.0 if i < bad else 1.0)), sound.solve(task)
+    assert result.status is Status.VALID
+    assert result.noise_factors == pytest.approx(expected.noise_factors, rel=0.3)
+    assert result.bearing.std < 1.3 * expected.bearing.std
+
+
 def test_good_windows_never_meet_the_budget(drive):
     estimator = WindowEstimator(CONFIG)
     assert not any(estimator.solve(task).search_ended for task in drive)

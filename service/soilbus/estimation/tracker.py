@@ -455,14 +455,17 @@ class Tracker:
     ) -> tuple[_Present, _Explanation]:
         """The first window again, until its own residuals say what its sensors are worth."""
         for _ in range(self.options.first_rounds):
-            fit = one.fit
-            if fit is None:
+            fit, work_before = one.fit, self._budget.work.instants
+            if fit is None or not self._budget.allows():
                 break
             ratios = correction_ratios(one.objective.problem, fit.optimum, self._components.options)
             self._components = self._components.after(ratios, whole=True)
             present = self._present(window, end)
             warm = warm_start(present.problem, self.soil_prior, fit, present.joint_prior)
             one = _Explanation(warm.objective, fit_warm(warm) or fit, present.since, None, transition=one.transition)
+            self._budget.spend(work_before)
+        if self.mismatch(one.fit):  # what no soil explains says nothing of the sensors
+            self._components = VarianceComponents(self.rig.options.variance)
         return present, one
 
     def _prediction(self, one: _Explanation) -> Mapping[str, Share]:
