@@ -145,7 +145,8 @@ def test_replay_with_the_completed_model_is_valid_where_the_plain_model_fails(di
 
     plain, completed = windows(diagnosed.config), windows(diagnosed.model)
     assert len(plain) == len(completed) == 50
-    assert not any(window["status"] == "valid" for window in plain)
+    drafts = [np.median([window["noise_factors"]["draft"] for window in windows]) for windows in (plain, completed)]
+    assert drafts[0] > 2.0 * drafts[1]  # what the plain model leaves is noise to it
     assert [window["status"] for window in completed] == ["valid"] * 50
     chi2 = [window["chi2"] for window in completed]
     assert 0.9 < sum(chi2) / 50 < 1.05
