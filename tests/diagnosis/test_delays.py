@@ -107,7 +107,7 @@ def test_a_configured_delay_is_taken_out_by_the_service(tmp_path):
         return float(np.median([w["standing"]["lateness.ground_speed"]["value"] for w in windows]))
 
     in_time = lateness(windows(delay=0.0))
-    assert lateness(windows()) == pytest.approx(in_time + 0.2, abs=0.06)
+    assert in_time + 0.1 < lateness(windows()) < in_time + 0.25  # its prior is about none
     for reported in (at_signal, by_effect):
         assert lateness(reported) == pytest.approx(in_time, abs=0.06)
         assert {w["status"] for w in reported} == {"valid"}

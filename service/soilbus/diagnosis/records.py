@@ -99,7 +99,7 @@ class Record:
 
 def diagnosed(rig: Rig) -> Rig:
     """Return the rig without standing parts: inertia and lateness are effects to be named; descents end nearer."""
-    search = replace(rig.options.search, cold=SolverOptions(), warm=SolverOptions(step_tolerance=2e-4))
+    search = replace(rig.options.search, cold=SolverOptions(100), warm=SolverOptions(100, step_tolerance=2e-4))
     return replace(rig, options=replace(rig.options, search=search, standing=HELD))
 
 
