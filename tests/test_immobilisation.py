@@ -361,7 +361,8 @@ def test_a_window_gives_a_curve_where_it_shows_the_strength_of_the_soil_however_
         return len(observed(Task(CONFIG.model_copy(update={"estimator": estimator}), "draft", 11)).curves)
 
     assert curves(max_bearing_std=1e-6) == 6
-    assert curves(max_tan_phi_std=1e-6) == 0
+    assert curves(max_bearing_std=1e-6, max_draft_std=1e-6) == 6  # tan phi says it
+    assert curves(max_draft_std=1e-6, max_tan_phi_std=1e-6) == 0
     assert curves(max_gain_error=1e-6) == 0
 
 

@@ -242,9 +242,7 @@ FAULTS = {
     ),
     "speed of another pulse wheel": Fault(le.scaled(1.3, SPEEDS[2]), BAD, lies("speed.RL")),
     "ground speed doubled": Fault(le.scaled(2.0, GROUND), BAD, lies("ground_speed")),
-    "ground speed halved": Fault(
-        le.scaled(0.5, GROUND), BAD, lies("ground_speed", "acceleration"), length=BORDER + 8.0
-    ),
+    "ground speed halved": Fault(le.scaled(0.5, GROUND), BAD, lies("ground_speed"), length=BORDER),
     "ground speed halved from the start": Fault(
         le.scaled(0.5, GROUND), BAD, lies("ground_speed", "acceleration"), since=FROM_THE_START, length=12.2
     ),

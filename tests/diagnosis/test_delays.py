@@ -107,7 +107,7 @@ def test_a_configured_delay_is_taken_out_by_the_service(tmp_path):
         return float(np.median([w["standing"]["lateness.ground_speed"]["value"] for w in windows]))
 
     in_time = lateness(windows(delay=0.0))
-    assert in_time + 0.1 < lateness(windows()) < in_time + 0.25  # its prior is about none
+    assert 0.1 < lateness(windows()) - in_time < 0.3  # a slope sees 0.14 to 0.2 of 0.2 s (seeds 506 to 508)
     for reported in (at_signal, by_effect):
         assert lateness(reported) == pytest.approx(in_time, abs=0.06)
         assert {w["status"] for w in reported} == {"valid"}
