@@ -207,8 +207,7 @@ class VarianceOptions:
     memory: float = 30.0
     """Windows [1] over which factors are averaged, one a hop: half a minute of the same ground."""
     least: float = 0.25
-    """Least factor on a variance of torque, draft or sinkage [1]: sensors twice as good as their data sheets say.
-    Loads and speeds have at least 1: data do not tell a regressor's noise from a flatter curve (Fuller 1987)."""
+    """Least factor on a variance [1]: sensors twice as good as their data sheets say."""
     most: float = 400.0
     """Largest factor on a variance [1]: twenty times the sd of a data sheet, as loads that shake by 12 % have beside
     cells of 0.8 %."""

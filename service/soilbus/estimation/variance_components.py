@@ -30,8 +30,6 @@ KINDS = {
     "load": ("load",), "speed": ("speed",), "ground_speed": ("ground_speed",), "computed_load": (),
 }  # fmt: skip
 """Quantities whose variance each factor scales; that of loads which no cell measures is of the rig."""
-RESPONSES = ("torque", "draft", "sinkage")
-"""Kinds that the model computes from loads and speeds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +74,7 @@ class VarianceComponents:
         factor = dict(self.factor)
         for kind, ratio in found.items():
             old = factor.get(kind, 1.0)
-            least = self.options.least if kind in RESPONSES else 1.0
-            factor[kind] = min(max(old * ratio**share, least), self.options.most)
+            factor[kind] = min(max(old * ratio**share, self.options.least), self.options.most)
         return replace(self, factor=factor, weight=self.weight + 1.0)
 
 
@@ -100,13 +97,15 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     by_latents = np.einsum("nml,nm->nl", A, e)
     shares = variance * np.einsum("nml,nmk,nkl->nl", A, inverse, A, optimize=True)
     of_rows = row_var * np.einsum("nmm->nm", inverse)
-    known = problem.known
+    layout, known = problem.layout, problem.known
     known = known & problem.measured_rows
     rows = np.where(known, np.sqrt(row_var) * e, 0.0), np.where(known, of_rows, 0.0)
     corrections, measured = np.sqrt(variance) * by_latents, problem.measured_latents
+    if problem.rig.lengths is not None:  # a track's load is the mean of a window, and single instants do not show it
+        shares[:, layout.loads] = np.where(problem.rig.lengths > 0.0, 0.0, shares[:, layout.loads])
     latents = corrections, np.where(measured, shares, 0.0)
     computed = corrections, np.where(measured, 0.0, shares)
-    layout, found = problem.layout, {}
+    found = {}
     for kind, (values, expected), columns in (
         ("torque", rows, layout.torques),
         ("draft", rows, slice(layout.balance, layout.balance + 1)),
