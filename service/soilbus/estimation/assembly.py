@@ -407,12 +407,12 @@ def _has_tyres(config: Config) -> bool:
 
 
 def delays_of(config: Config) -> dict[str, float]:
-    """Delay [s] of each quantity by the effect channel_lag of model.effects; ConfigError as `effects_of`."""
+    """Delay [s] of each quantity by the effects of model.effects that make it late; ConfigError as `effects_of`."""
     if not config.model.effects:
         return {}
-    from soilbus.terra.effects.sensors import CHANNEL_LAG, lateness
+    from soilbus.terra.effects.sensors import lateness
 
-    return lateness([active for active in effects_of(config) if active.effect is CHANNEL_LAG])
+    return lateness(effects_of(config))
 
 
 def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
@@ -423,7 +423,8 @@ def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[t
     config : Config
         Validated configuration.
     undelayed : bool
-        Whether the intake has already corrected the delays of channels (`delays_of`), so that channel_lag is left out.
+        Whether the intake has already corrected the delays of channels (`delays_of`), so that effects which
+        make channels late are left out.
 
     Returns
     -------
@@ -443,7 +444,7 @@ def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[t
     active = [
         a
         for a in effects_of(config, wheels)
-        if not (a.effect.of_record or (undelayed and a.effect.name == "channel_lag"))
+        if not (a.effect.of_record or (undelayed and a.effect.late))
     ]
     free: list[Free] = []
     for effect, values in active:
