@@ -441,11 +441,7 @@ def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[t
     """
     wheels = rig_of(config).wheels
     settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
-    active = [
-        a
-        for a in effects_of(config, wheels)
-        if not (a.effect.of_record or (undelayed and a.effect.late))
-    ]
+    active = [a for a in effects_of(config, wheels) if not (a.effect.of_record or (undelayed and a.effect.late))]
     free: list[Free] = []
     for effect, values in active:
         for parameter in effect.parameters:
