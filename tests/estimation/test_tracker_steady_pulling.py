@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from soilbus.decision.traversability import State, Status
-from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
@@ -43,7 +43,7 @@ def test_constant_draft_after_a_border_leaves_no_gap(scenario, seed):
         assert result.traversability.state is not State.GO or result.status is Status.VALID
     assert sum(result.traversability.max_draft is None for result in results) <= 4  # the border
     rig, largest = rig_of(CONFIG), CONFIG.traversability.max_slip
-    truth = true_largest_draft(clay, rig, np.full(len(rig.wheels), np.inf), largest)
+    truth = true_largest_draft(clay, rig, np.full(len(rig.wheels), np.inf), largest, model_of(CONFIG))
     for result in results[-10:]:  # the pressure at 2 cm slides along n, which nothing excites; the draft does not
         assert result.reason.split()[0] in ("none", "not_excited")
         most = result.traversability.max_draft
