@@ -210,7 +210,7 @@ def assess(
         For a rig without a chassis.
     """
     uncertain = UncertainModel.over(model)
-    points = SigmaPoints.of(posterior, uncertain.shifts)
+    points = SigmaPoints.of(posterior, uncertain.shifts, float(rig.width.mean()))
     driven = ~(torque_limit <= 0.0)
     completed = uncertain.of_rows(len(points.soils))
     table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, NEWTON_TOLERANCE, driven)
