@@ -465,18 +465,23 @@ def _jumps(data: ConsistencyInput) -> bool:
 
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
-    """The draft, where the vehicle pulls less whenever its wheels drive more; needs slope and inertia."""
+    """The draft, where the vehicle is pushed, and the more so whenever its wheels drive more; needs slope and inertia.
+
+    On soft ground it may also pull less when its wheels drive more, for they sink; but it pulls.
+    """
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None:
         return
     lag, weight, variance = data.sustained, chassis.mass * GRAVITY, window.variance
-    driven = change((window.torque / rig.radius).sum(axis=1), lag)
+    thrust = (window.torque / rig.radius).sum(axis=1)
+    driven = change(thrust, lag)
     noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
     known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
-    pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
+    pulled = np.where(known & data.driving, pull_given(window, chassis), np.nan)
+    pull = change(pulled, lag)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
     pull_noise = np.sqrt(change_variance(of_pull, lag))
-    if _opposite(data, (driven, pull), (noise, pull_noise)):
+    if median(pulled * thrust) < 0.0 and _opposite(data, (driven, pull), (noise, pull_noise)):
         yield "draft"
 
 
