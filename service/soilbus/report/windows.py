@@ -105,7 +105,7 @@ def machine_line(results: Sequence[WindowResult]) -> str | None:
     units = {"relaxation_length": "m", "wheel_inertia": "kg m^2"}
     parts = [
         (name.removeprefix("lateness.").replace("_", " ") + (" late by" if name.startswith("lateness.") else ""),
-         f"{of.value:.2g} +- {of.std:.1g} {units.get(name, 's')}")
+         f"{of.value:.2g} +- {of.std:.2g} {units.get(name, 's')}")
         for name, of in found.items()
     ]  # fmt: skip
     return "the machine, beside its torque: " + ", ".join(f"{name} {value}" for name, value in parts)
