@@ -69,7 +69,7 @@ def faults(*sets: str) -> list[str]:
         ("estimatr.hop=1", "estimatr: unknown key; did you mean estimator?"),
         ("bus.chanel=can1", "bus: chanel: unknown key; did you mean channel?"),
         ("model.shear_law=rationl", 'model.shear_law: "rationl" is not one of exponential, rational; did you mean'),
-        ("wheel.FL.axle=fornt", 'wheel.FL.axle: "fornt" is not one of front, rear; did you mean front?'),
+        ("wheel.FL.axle=fornt", 'wheel.FL.axle: "fornt" is not one of front, middle, rear; did you mean front?'),
         ("wheel.FL.gear_ratio=24:1", 'wheel.FL.gear_ratio: "24:1" is not a number'),
         ("wheel.FL.torque=7", 'wheel.FL.torque: 7 is not "Message.Signal", nor a table with signal, sign, at,'),
         ("wheel.FL.speed=Speed", 'wheel.FL.speed.signal: "Speed" is not "Message.Signal", the names of a message and'),
