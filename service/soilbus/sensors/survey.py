@@ -559,7 +559,7 @@ def _weight(facts: Facts) -> Iterator[Finding]:
         return
     draft, acceleration = (np.where(np.isfinite(a), a, 0.0) for a in (window.draft, window.acceleration))
     due = [median(np.broadcast_to(a, window.t.shape)) for a in axle_loads(chassis, draft, pitch, acceleration)]
-    has = [median(window.load[:, rig.front].sum(axis=1)), median(window.load[:, ~rig.front].sum(axis=1))]
+    has = [median(window.load @ ahead) for ahead in (rig.ahead, 1.0 - rig.ahead)]
     if max(has) > (1.0 + LIMITS.weight) * weight:
         axle = "front" if has[0] > has[1] else "rear"
         yield Finding(
@@ -574,6 +574,7 @@ def _weight(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             f"the front wheels carry {has[0] / 1e3:.1f} kN and the rear wheels {has[1] / 1e3:.1f} kN, where mass,"
             f" centre of gravity and draft give {due[0] / 1e3:.1f} and {due[1] / 1e3:.1f} kN: "
+            + ("axles between them count on both by their place; " if len(rig.axles) > 2 else "")
             + (
                 "are the loads of front and rear wheels swapped?"
                 if swapped
@@ -593,7 +594,7 @@ def _transfer(facts: Facts) -> Iterator[Finding]:
     known = (np.where(np.isfinite(a), a, 0.0) for a in (window.pitch, window.acceleration))
     front = np.broadcast_to(axle_loads(chassis, window.draft, *known)[0], window.t.shape)
     lag, block = _steps(facts)
-    more = window.load[:, rig.front].sum(axis=1) - window.load[:, ~rig.front].sum(axis=1)
+    more = window.load @ (2.0 * rig.ahead - 1.0)
     rows = np.stack([change(more, lag), 2.0 * change(np.where(facts.straight, front, np.nan), lag)], axis=1)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if len(rows) < 40 * block:
