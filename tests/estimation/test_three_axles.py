@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from six_wheels import MIDDLE, PLACES, six_wheels
+from soilbus.config.file import machine, parse_config
 from soilbus.decision.balance import Duty, balance
 from soilbus.decision.wheels import wheel_table
 from soilbus.estimation.assembly import motors_of, rig_of
@@ -108,6 +111,16 @@ def test_a_shaft_drives_three_axles_by_their_grip():
     assert [(c.one, c.other, c.locked) for c in between] == [((0, 1), (2, 3), True), ((2, 3), (4, 5), True)]
     (motor,) = [m for m in motors_of(config, rig).motors if m.name == "both"]
     assert motor.share == pytest.approx(np.repeat(of_springs(0.0), 2) / 2.0 / WEIGHT)
+
+
+def test_the_wheels_of_a_single_axle_carry_all_of_the_weight():
+    raw = tomllib.loads(machine("tractor").read_text(encoding="utf-8"))
+    wheels = [{k: v for k, v in of.items() if k != "load"} | {"axle": "only"} for of in raw["wheel"][2:]]
+    vehicle = {"mass": 500.0, "cg_height": 0.6, "hitch_height": 0.4}
+    config = parse_config(raw | {"vehicle": vehicle, "wheel": wheels, "axle": [{"name": "only"}]}, folder=Path())
+    rig = rig_of(config)
+    assert window_of(rig, driving(rig)).load[0] == pytest.approx([500.0 * 9.80665 / 2.0] * 2)
+    assert config.vehicle.wheelbase == pytest.approx(2.0 * 0.62)
 
 
 @pytest.mark.parametrize(

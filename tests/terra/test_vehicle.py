@@ -99,7 +99,7 @@ def test_wheels_of_any_number_of_axles_balance_as_equal_springs_below_a_rigid_fr
 
 
 def test_tracks_or_one_axle_carry_all_of_it_wherever_it_acts():
-    tracked = dataclasses.replace(TRACTOR, on_tracks=True)
+    tracked = dataclasses.replace(TRACTOR, on_one_axle=True)
     assert wheel_loads(tracked, np.ones(2), 9e3, 0.1, 0.0) == pytest.approx(
         [2300.0 * 9.80665 * math.cos(0.1) / 2.0] * 2
     )

@@ -939,18 +939,25 @@ class Config(_Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _vehicle_on_tracks(cls, value: Any) -> Any:
-        """What follows for [vehicle] from tracks that carry all of it."""
-        if not isinstance(value, Mapping) or value.get("wheel") or not isinstance(value.get("vehicle"), Mapping):
+    def _vehicle_on_one_axle(cls, value: Any) -> Any:
+        """What follows for [vehicle] from tracks, or from the wheels of a single axle, that carry all of it."""
+        if not isinstance(value, Mapping) or not isinstance(value.get("vehicle"), Mapping):
             return value
-        given = value.get("track")
-        tracks = [t for t in (given if isinstance(given, list) else [given]) if isinstance(t, Mapping)]
-        if not tracks or all("axle" in track for track in tracks):
+        wheels, tracks = (
+            [part for part in (given if isinstance(given, list) else [given]) if isinstance(part, Mapping)]
+            for given in (value.get("wheel"), value.get("track"))
+        )
+        names = {str(wheel.get("axle", "front")) for wheel in wheels}
+        if wheels and len(names) == 1 and not tracks and not names & {"front", "middle", "rear"}:
+            key, size, steering = "radius", 2.0, "wheels"
+        elif tracks and not wheels and any("axle" not in track for track in tracks):
+            key, size, steering = "contact_length", 1.0, "skid"
+        else:
             return value
-        lengths = [t["contact_length"] for t in tracks if type(t.get("contact_length")) in (int, float)]
-        usual = [float(length) for length in lengths if CONTACT_LENGTH.low <= length <= CONTACT_LENGTH.high]
-        length = usual[0] if usual else WHEELBASE.high  # then the fault is that of the track alone
-        defaults = {"wheelbase": length, "steering": "skid", "cg_ahead_of_rear_axle": length / 2.0}
+        lengths = [size * part[key] for part in (*wheels, *tracks) if type(part.get(key)) in (int, float)]
+        usual = [length for length in lengths if WHEELBASE.low <= length <= WHEELBASE.high]
+        length = usual[0] if usual else WHEELBASE.high  # then the fault is that of the wheel or track alone
+        defaults = {"wheelbase": length, "steering": steering, "cg_ahead_of_rear_axle": length / 2.0}
         return {**value, "vehicle": defaults | dict(value["vehicle"])}
 
     @model_validator(mode="before")
@@ -1021,9 +1028,10 @@ class Config(_Section):
         return {name: given.get(name, 1.0 - i / (len(names) - 1)) for i, name in enumerate(names)}
 
     @property
-    def on_tracks(self) -> bool:
-        """Whether tracks carry the whole vehicle."""
-        return bool(self.track) and all(t.axle is None for t in self.track)
+    def on_one_axle(self) -> bool:
+        """Whether tracks, or the wheels of a single axle of its own name, carry the whole vehicle."""
+        is_whole = bool(self.track) and all(t.axle is None for t in self.track)
+        return is_whole or (len(self.axles) == 1 and not self.axles.keys() & {"front", "middle", "rear"})
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:

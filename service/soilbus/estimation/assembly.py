@@ -144,7 +144,7 @@ def _unmeasured(config: Config) -> Iterator[str]:
                 f"{w.section} {w.name} has no load: map {w.section}.{w.name}.load, or give the [vehicle]"
                 " whose weight it carries"
             )
-    if config.vehicle is not None and not config.on_tracks:
+    if config.vehicle is not None and not config.on_one_axle:
         for axle in ("front", "rear") if config.axles.keys() & {"front", "middle", "rear"} else ():
             if axle not in config.axles:
                 yield f"no [[wheel]] is on the {axle} axle, which carries its share of the weight: give all wheels"
@@ -322,7 +322,7 @@ def chassis_of(config: Config) -> Chassis | None:
     if config.vehicle is None:
         return None
     given = config.vehicle.model_dump(include={f.name for f in fields(Chassis)})
-    return Chassis(**given, on_tracks=config.on_tracks)
+    return Chassis(**given, on_one_axle=config.on_one_axle)
 
 
 def prior_of(config: Config) -> SoilPrior:

@@ -362,7 +362,7 @@ def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
     chassis, vehicle = chassis_of(config), config.vehicle
     if chassis is None or vehicle is None or not config.wheel:
         raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
-    if not chassis.on_tracks and len(config.axles) < 2:
+    if not chassis.on_one_axle and len(config.axles) < 2:
         raise SimulationError("the simulator needs wheels on both axles")
     if not scenario.drawn_mass:
         return chassis
@@ -434,7 +434,7 @@ def _situation(
     level = loads(0.0)
     drawn = loads(0.0, 1.0) if climbs else loads(test_draft)
     upright = share * wheel_loads(chassis, ahead, 0.0, 0.0, 0.0)[:, None] * float(climbs)
-    to_cg = 0.0 * ahead if chassis.on_tracks else ahead * chassis.wheelbase - chassis.cg_ahead_of_rear_axle
+    to_cg = 0.0 * ahead if chassis.on_one_axle else ahead * chassis.wheelbase - chassis.cg_ahead_of_rear_axle
     position = motion.distance + to_cg[:, None]
     soil = soil_along(plan.scenario.soils, position, plan.scenario.transition)
 

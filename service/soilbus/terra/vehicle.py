@@ -21,7 +21,7 @@ GRAVITY = 9.80665
 class Chassis:
     """Mass [kg] and lengths [m] of a vehicle, wheelbase from its first to its last axle; heights above the ground.
 
-    on_tracks: the tracks of its front carry all of it, wherever the load acts (uniform pressure).
+    on_one_axle: its tracks, or the wheels of a single axle, carry all of it, wherever the load acts.
     """
 
     mass: float
@@ -29,7 +29,7 @@ class Chassis:
     cg_ahead_of_rear_axle: float
     cg_height: float
     hitch_height: float
-    on_tracks: bool = False
+    on_one_axle: bool = False
 
     @property
     def in_reverse(self) -> Chassis:
@@ -83,7 +83,7 @@ def axle_loads(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> t
     weight = chassis.mass * GRAVITY
     along = weight * np.sin(pitch) + chassis.mass * acceleration
     across = weight * np.cos(pitch)
-    if chassis.on_tracks:
+    if chassis.on_one_axle:
         front = across + 0.0 * (along + draft)
         return front, 0.0 * front
     moment = across * chassis.cg_ahead_of_rear_axle - along * chassis.cg_height - draft * chassis.hitch_height
