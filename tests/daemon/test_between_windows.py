@@ -73,7 +73,7 @@ def test_in_reverse_a_machine_climbs_as_its_mirror_image_does_forward():
     """Rear wheels that drive backward are the front wheels of the mirrored machine: both are unloaded uphill."""
     rig, soil = rig_of(REAR_DRIVEN), Posterior(soil_named("loam"), np.zeros((6, 6)))
     ahead = rig.chassis.wheelbase - rig.chassis.cg_ahead_of_rear_axle
-    mirrored = replace(rig, front=~rig.front, chassis=replace(rig.chassis, cg_ahead_of_rear_axle=ahead))
+    mirrored = replace(rig, ahead=1.0 - rig.ahead, chassis=replace(rig.chassis, cg_ahead_of_rear_axle=ahead))
     able = [
         assess(soil, machine, model_of(REAR_DRIVEN), None, np.full(4, np.nan), 0.6, 0.5)[0]
         for machine in (rig, replace(rig, chassis=rig.chassis.in_reverse), mirrored)

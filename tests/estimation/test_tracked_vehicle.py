@@ -67,7 +67,7 @@ def test_tracks_are_a_rig_of_wheels_with_a_length():
     rig = rig_of(crawler())
     assert rig.wheels == ("L", "R")
     assert rig.length.tolist() == [L, L]
-    assert rig.chassis.on_tracks
+    assert rig.chassis.on_one_axle
     assert rig.max_lateral is not None  # it steers by skidding
 
 

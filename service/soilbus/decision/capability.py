@@ -136,7 +136,7 @@ class Capability:
     limit
         What ends max_draft.
     set_points
-        By axle.
+        Of the front axle, and of all axles behind it together.
     forecast
         None where most likely no slip gives the demand.
     over_slip

@@ -46,6 +46,9 @@ class MeasurementOptions:
     side_slope_share: float = 0.06
     """Sd of an axle's mean loads left less right over their sum [1] on side slopes, where no roll is measured: 3
     degrees."""
+    axle_share: float = 0.1
+    """Sd of an axle's mean load beside the line through the others' over it [1], on three axles or more: a
+    tyre deflects by 30 to 50 mm under its load, so that 4 mm of wear, or a tenth less pressure, take a tenth of it."""
     largest_draft: float = 0.5
     """Largest draft that nothing measures, over the weight [1]: where net traction ratios of tractors in fields end
     (Wismer & Luth 1974).  It shifts load to the rear in all of a window; counted as independent from bin to bin it left

@@ -421,7 +421,7 @@ class Tracker:
         start, transition = end - self.settings.window, self._state.transition
         since = start if transition is None else max(transition.end, start)
         if transition is not None:
-            window = without_transition(window, transition, self.rig.front)
+            window = without_transition(window, transition, self.rig.ahead)
             window = window.rows(np.flatnonzero(window.t >= transition.end))
         problem = self._problem(window)
         return _Present(window, problem, self._prior_at(since, problem), since, end)
@@ -529,7 +529,7 @@ class Tracker:
             window, candidates, self._new_soil_prior, joint_prior, lambda fit: not self.mismatch(fit)
         )
         if new is not None and new.transition is not None:
-            separated = without_transition(window, new.transition, self.rig.front)
+            separated = without_transition(window, new.transition, self.rig.ahead)
             whole = present._replace(window=separated, problem=self._problem(separated))
             if old is not None and not self._are_likelier(old, new.fit, self._searched(whole).fit):
                 return None
@@ -552,7 +552,7 @@ class Tracker:
         None where none does, or too few data are left.
         """
         for transition in transitions:
-            separated = without_transition(window, transition, self.rig.front)
+            separated = without_transition(window, transition, self.rig.ahead)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
             arrived = transition.end + transition.lag if self._state.mismatch else transition.end
             if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:

@@ -333,8 +333,7 @@ def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
     """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
     draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
     due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
-    reported = np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1)
-    return np.asarray(reported - due)
+    return np.asarray(window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1) - due)
 
 
 def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
