@@ -130,10 +130,9 @@ class SigmaPoints:
 
 def moduli(soil: Soil, steps: Array, width: float) -> Array:
     """Return k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
-    of_k_c = soil.k_c / width
-    K_L = of_k_c + soil.k_phi
-    K_L = K_L * np.exp((of_k_c * steps[:, _K_C] + soil.k_phi * steps[:, _K_PHI]) / K_L)
-    of_k_c = np.minimum(of_k_c * np.exp(np.minimum(steps[:, _K_C], MAX_STEP)), (1.0 - LEAST_K_PHI) * K_L)
+    part, whole = soil.k_c / width, soil.k_c / width + soil.k_phi
+    K_L = whole * np.exp((part * steps[:, _K_C] + soil.k_phi * steps[:, _K_PHI]) / whole)
+    of_k_c = np.minimum(part * np.exp(np.minimum(steps[:, _K_C], MAX_STEP)), (1.0 - LEAST_K_PHI) * K_L)
     return np.stack([of_k_c * width, K_L - of_k_c], axis=1)
 
 

@@ -317,9 +317,10 @@ def effect_lines(config: Config) -> list[str]:
 
     effects, free = effects_and_parameters_of(config)
     lines = []
-    for effect, values in effects_of(config):
+    for active in effects_of(config):
+        effect = active.effect
         if effect.late:
-            late = ", ".join(f"{quantity} {delay:.3g} s" for quantity, delay in lateness([(effect, values)]).items())
+            late = ", ".join(f"{quantity} {delay:.3g} s" for quantity, delay in lateness([active]).items())
             lines.append(f"{effect.name}: taken out of the samples' stamps: {late}")
             continue
         if effect not in effects:
