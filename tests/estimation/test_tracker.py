@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import TrackerOutput, TrackerState
+from soilbus.estimation.soil_state import TrackerState
+from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -9,7 +9,7 @@ import pytest
 
 from soilbus.decision.traversability import Status
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.tracker import SearchBudget
+from soilbus.estimation.search_budget import SearchBudget
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

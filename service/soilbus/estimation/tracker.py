@@ -10,15 +10,9 @@
 
 A window is fitted as one soil, from the optimum of the last one (warm start).  Where the newest data disagree with
 that soil (change_detection) or it does not describe the window, another soil is searched for (`Tracker._explained`),
-and `next_state` says which soil the estimate is of:
+and `soil_state` says which soil the estimate is of.
 
-    STEADY       one soil; the recursion above
-    SUSPECT      a change point, and too few data after it for a second soil
-    TRANSITION   two soils have much more evidence than one, but the border may not be over: the second has the wide
-                 prior of a new soil and the gains of the recursion; data between the soils are left out
-    NEW_SOIL     the border is over and less than a window old; once it is out of the window, STEADY
-
-A fit that exceeds its chi-square limit is a mismatch and never a prior.  Searches from many starts are
+A fit that does not describe its data is a mismatch and never a prior.  Searches from many starts are
 limited by `SearchBudget`.
 """
 
@@ -27,13 +21,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.change_detection import ChangeStatistic, Transition, change_statistic, without_transition
+from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
@@ -42,12 +35,13 @@ from soilbus.estimation.observation_model import (
     TIME_TOLERANCE,
     ObservationModel,
     ObservationModelWithEffects,
-    Work,
 )
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.prediction import Share, prediction_shares
+from soilbus.estimation.search_budget import SearchBudget
+from soilbus.estimation.soil_state import ChangePoint, Reason, Shown, SoilState, TrackerState, next_state
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.variance_components import VarianceComponents, correction_ratios
 from soilbus.estimation.window import Rig, Window, window_of_samples
@@ -56,57 +50,14 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
 
 __all__ = [
-    "ChangePoint",
-    "Reason",
-    "SearchBudget",
     "Settings",
-    "Shown",
-    "SoilState",
     "Tracker",
     "TrackerOutput",
-    "TrackerState",
     "gain_errors",
     "new_soil_prior",
-    "next_state",
 ]
 
 _SOIL = len(PARAMETERS)
-
-
-class TrackerState(StrEnum):
-    """Which soil a window's estimate is of."""
-
-    STEADY = "steady"
-    """The soil of the windows before."""
-    SUSPECT = "suspect"
-    """The newest data disagree with this soil, but are too few to estimate another; the estimate is of this soil."""
-    TRANSITION = "transition"
-    """Another soil; the border may not be over: its data do not agree yet."""
-    NEW_SOIL = "new_soil"
-    """Another soil for less than a window; only its own data count."""
-
-
-class Reason(StrEnum):
-    """Why a window has its state."""
-
-    ONE_SOIL = "one_soil"
-    """Its data agree with the soil of the windows before (steady)."""
-    TOO_FEW_DATA = "too_few_data"
-    """It has too few residuals to be fitted (steady)."""
-    UNCONFIRMED = "change_unconfirmed"
-    """The change statistic exceeds its threshold, but two soils are not much likelier than one (steady)."""
-    MISMATCH = "mismatch"
-    """No soil describes it (steady), or its newest part (suspect)."""
-    CHANGE_STATISTIC = "change_statistic"
-    """The change statistic exceeds its threshold (suspect)."""
-    TWO_SOILS = "two_soils_likelier"
-    """Two soils have much more evidence than one (new soil)."""
-    ANOTHER_SOIL = "prior_conflict"
-    """Its data conflict with the present soil's prior and are of another one (new soil)."""
-    SPANS_BORDER = "window_spans_border"
-    """The last border is less than a window ago (new soil)."""
-    UNSETTLED = "unsettled"
-    """The fit of the new soil exceeds its chi-square limit just after a border (transition)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,93 +93,6 @@ class Settings:
     search_rate: float = 4.0
     search_burst: float = 100.0
     hop: float = 1.0
-
-
-class ChangePoint(NamedTuple):
-    """Time t [s] from which the data disagree with the present soil, ground speed [m/s] then, and why."""
-
-    t: float
-    speed: float
-    statistic: ChangeStatistic
-
-
-@dataclass(frozen=True, slots=True)
-class SoilState:
-    """Which soil the windows are of.
-
-    Attributes
-    ----------
-    name, reason
-        The state, and why it is so.
-    transition
-        The last one: data before its end are of another soil.
-    change
-        A change point that no other soil explains yet.
-    mismatch
-        Whether the last fit was a mismatch.
-    """
-
-    name: TrackerState = TrackerState.STEADY
-    reason: Reason = Reason.ONE_SOIL
-    transition: Transition | None = None
-    change: ChangePoint | None = None
-    mismatch: bool = False
-
-    def spans_border(self, start: float) -> bool:
-        """Whether a window from `start` [s] on may still have data of another soil."""
-        is_open = self.name is TrackerState.TRANSITION and self.mismatch
-        return self.transition is not None and (is_open or start < self.transition.end)
-
-
-class Shown(NamedTuple):
-    """What a window shows.
-
-    Attributes
-    ----------
-    found
-        Why data before the end of `transition` are of another soil than those after it, or before `change` than those
-        after it; None where they are of the soil of the window before.
-    transition
-        The last transition, found now or before.
-    change
-        The change point, where there is one.
-    mismatch, settled
-        Whether the fit exceeds its limit of chi-square; whether it keeps that just after a border.
-    """
-
-    found: Reason | None
-    transition: Transition | None
-    change: ChangePoint | None
-    mismatch: bool
-    settled: bool
-
-
-def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
-    """State after a window that ended at `end` [s], of length `window` [s].
-
-    Parameters
-    ----------
-    state : SoilState
-        After the window before.
-    shown : Shown
-        What the window shows.
-    end, window : float
-        [s].
-
-    Returns
-    -------
-    SoilState
-    """
-    S, transition, now = TrackerState, shown.transition, replace(state, change=shown.change, mismatch=shown.mismatch)
-    if shown.found in (Reason.CHANGE_STATISTIC, Reason.MISMATCH):
-        return replace(now, name=S.SUSPECT, reason=shown.found)
-    if transition is None or not (shown.found or state.spans_border(end - window)):
-        one = Reason.ONE_SOIL if shown.change is None else Reason.UNCONFIRMED
-        return replace(now, name=S.STEADY, reason=Reason.MISMATCH if shown.mismatch else one)
-    now = replace(now, transition=transition)
-    if not shown.settled:
-        return replace(now, name=S.TRANSITION, reason=Reason.UNSETTLED)
-    return replace(now, name=S.NEW_SOIL, reason=shown.found or Reason.SPANS_BORDER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -683,61 +547,6 @@ class Tracker:
         if learned and state.name in (TrackerState.STEADY, TrackerState.NEW_SOIL):
             self._posteriors.append((end, replace(fit.mode.likelihood_factor(self.soil_prior), form=fit.form)))
             self._newest_posterior = fit.mode
-
-
-class SearchBudget:
-    """Token bucket of model evaluations for searches, counted in whole windows, so that a replay is reproducible.
-
-    Parameters
-    ----------
-    rate : float
-        Evaluations that each window adds.
-    burst : float
-        Most evaluations that are kept for later.
-
-    Notes
-    -----
-    A window that follows another needs a few evaluations.  At a start, a border or after a gap
-    a search from many soils is due, and soon succeeds.  Where the model does not describe the
-    data no search succeeds, window after window; the empty bucket then limits the cost.
-
-    References
-    ----------
-    Turner 1986, IEEE Communications 24(10):8.
-
-    Examples
-    --------
-    >>> budget = SearchBudget(rate=4.0, burst=10.0)
-    >>> budget.next_window(instants=200)
-    >>> budget.allows()
-    True
-    >>> before = budget.work.instants
-    >>> budget.work.instants += 2000  # ten evaluations of the window
-    >>> budget.spend(before)
-    >>> budget.allows()
-    False
-    """
-
-    def __init__(self, rate: float, burst: float) -> None:
-        self.work = Work()
-        self._rate, self._burst = rate, burst
-        self._remaining, self._window = burst, 1
-        self.ended = False
-
-    def next_window(self, instants: int, refill: bool = False) -> None:
-        """A window of N instants begins; refill: the model described recent data, so the bucket is filled."""
-        self._remaining = self._burst if refill else min(self._remaining + self._rate, self._burst)
-        self._window = max(instants, 1)
-        self.ended = False
-
-    def allows(self) -> bool:
-        """Whether evaluations remain for a search; if not, `ended` is set."""
-        self.ended = self.ended or self._remaining <= 0.0
-        return self._remaining > 0.0
-
-    def spend(self, work_before: int) -> None:
-        """Take the evaluations since `work_before` [instants] from the bucket, which one search may overdraw."""
-        self._remaining -= (self.work.instants - work_before) / self._window
 
 
 def new_soil_prior(prior: SoilPrior) -> SoilPrior:

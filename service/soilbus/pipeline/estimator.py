@@ -53,8 +53,9 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
+from soilbus.estimation.soil_state import Reason, TrackerState
 from soilbus.estimation.standing import STANDING, wheel_inertia
-from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput, TrackerState
+from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput
 from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.determination import draft_is_known, excitation_of, lacking, sinkage_range

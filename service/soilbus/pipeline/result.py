@@ -34,7 +34,7 @@ def is_date(t: float) -> bool:
 
 
 class SoilChange(NamedTuple):
-    """Which soil a window is of (`tracker.TrackerState`), and why (`tracker.Reason`).
+    """Which soil a window is of (`soil_state.TrackerState`), and why (`soil_state.Reason`).
 
     The change statistic and its threshold are None without a change point.
     """
