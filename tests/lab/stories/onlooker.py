@@ -141,7 +141,7 @@ def good_tracked(config: Config = CONFIG) -> TrackerOutput:
     config = config.model_copy(update={"estimator": reference_configuration().estimator.model_copy(update=limits)})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
-    messages = drive_messages(config, 20.0)
+    messages = drive_messages(config, 40.0)  # the rear-driven one knows its largest draft after half a minute
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
