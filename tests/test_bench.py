@@ -110,7 +110,7 @@ def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known)
     )
     ours = window.fit_window(*problem)
     peer = window.by_finite_differences(*problem)
-    assert window.distance(problem, ours, peer) < 0.02
+    assert window.distance(problem, ours, peer) < 0.1  # in posterior sd, to which descents end
 
 
 def test_different_ends_are_no_figure(small, monkeypatch, capsys):

@@ -313,6 +313,21 @@ def test_first_order_is_exact_for_what_is_linear_and_blind_to_what_only_bends():
     assert mean > 7.0 + 0.5 * 5.0 * posterior.log_covariance[1, 1]
 
 
+def test_wheels_of_one_width_know_their_modulus_whatever_its_parts():
+    """k_phi is a hundredth of K_L and its logarithm open; K_L, known to 3 %, is that of every point."""
+    width, soil = 0.3, SOILS["loam"]._replace(k_c=1e5, k_phi=3e3)
+    of_k_c = soil.k_c / width
+    by_k_c = np.array([0.3, -0.3 * of_k_c / soil.k_phi])  # k_c for k_phi at one K_L
+    by_K_L = 0.03 * np.array([1.0, 1.0])
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2] = np.outer(by_k_c, by_k_c) + np.outer(by_K_L, by_K_L)
+    points = SigmaPoints.of(Posterior(soil, covariance), None, width)
+    K_L = points.soils[:, 0] / width + points.soils[:, 1]
+    assert (points.soils[:, :2] > 0.0).all()
+    mean, std = mean_and_std(points.drawn(np.log(K_L)))
+    assert (mean, std) == pytest.approx((math.log(of_k_c + soil.k_phi), 0.03), rel=0.01)
+
+
 def test_a_mean_that_is_not_known_has_no_std():
     samples = np.full((9, 3), np.nan)
     samples[:, 0], samples[:4, 1], samples[1:, 2] = np.arange(9.0), 2.0, 1.0

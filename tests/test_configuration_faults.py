@@ -33,6 +33,56 @@ def faults(*sets: str) -> list[str]:
     return [fault.removeprefix(f"{FIELD}: ") for fault in error.value.faults]
 
 
+SIX = {"front": "F", "middle": "M", "rear": "R"}
+
+
+def of_six(*axles: dict[str, Any], **changed: str) -> dict[str, Any]:
+    """Three axles as `parse_config` takes them; changed: axles of wheels by name."""
+    size = {"radius": 0.5, "width": 0.3}
+    wheels = [{"name": letter + side, "axle": axle, **size} for axle, letter in SIX.items() for side in "LR"]
+    vehicle = {"mass": 3600.0, "wheelbase": 2.4, "cg_ahead_of_rear_axle": 1.2, "cg_height": 0.8}
+    wheels = [wheel | ({"axle": changed[wheel["name"]]} if wheel["name"] in changed else {}) for wheel in wheels]
+    return {"vehicle": vehicle, "axle": list(axles), "wheel": wheels}
+
+
+@pytest.mark.parametrize(
+    ("raw", "line"),
+    [
+        (of_six(ML="midle"), 'wheel.ML.axle: "midle" is not one of front, middle, rear; did you mean middle?'),
+        (of_six(ML="bogie"), 'wheel.ML.axle: "bogie" is not one of front, middle, rear; an axle of another name needs'),
+        (of_six(FL="both"), 'wheel.FL.axle: "both" is not one of front, middle, rear'),
+        (of_six({"name": "middle", "load": "A.B"}, {"name": "middle", "load": "A.C"}), "two axles are named middle"),
+        (of_six({"name": "second"}), "axle second has no [[wheel]]"),
+        (of_six({"name": "middle", "ahead_of_rear_axle": 2.5}), "the axles front, middle, rear must stand from the"),
+        (of_six({"name": "rear", "ahead_of_rear_axle": 1.0}), "axle rear: ahead_of_rear_axle is for axles between"),
+        (of_six({"name": "middle", "ahead_of_rear_axle": 1200.0}), "axle.middle.ahead_of_rear_axle: 1200 m is not"),
+        (
+            of_six({"name": "first"}, {"name": "middle", "ahead_of_rear_axle": 1.2}, FR="first"),
+            "axle first: ahead_of_rear_axle: missing",
+        ),
+        (
+            of_six(
+                {"name": "a", "ahead_of_rear_axle": 0.6}, {"name": "b", "ahead_of_rear_axle": 1.2},
+                FR="a", ML="b", MR="b",
+            ),
+            "the axles front, a, b, rear must stand from the front to the rear",
+        ),
+        (of_six() | {"wheel": [*of_six()["wheel"], of_six()["wheel"][2]]}, "two wheels are named ML"),
+    ],
+)  # fmt: skip
+def test_a_mistake_of_axles_is_one_line(raw, line):
+    with pytest.raises(ConfigError) as error:
+        parse_config(raw)
+    (fault,) = error.value.faults
+    assert fault.removeprefix("configuration: ").startswith(line)
+
+
+def test_axles_of_own_names_stand_in_the_order_of_their_tables():
+    names = dict(zip(("FL", "FR", "ML", "MR", "RL", "RR"), "aabbcc", strict=True))
+    config = parse_config(of_six(*({"name": name} for name in "cab"), **names))
+    assert config.axles == {"c": 1.0, "a": 0.5, "b": 0.0}
+
+
 @pytest.mark.parametrize(
     ("override", "line"),
     [
@@ -69,7 +119,7 @@ def faults(*sets: str) -> list[str]:
         ("estimatr.hop=1", "estimatr: unknown key; did you mean estimator?"),
         ("bus.chanel=can1", "bus: chanel: unknown key; did you mean channel?"),
         ("model.shear_law=rationl", 'model.shear_law: "rationl" is not one of exponential, rational; did you mean'),
-        ("wheel.FL.axle=fornt", 'wheel.FL.axle: "fornt" is not one of front, rear; did you mean front?'),
+        ("wheel.FL.axle=fornt", 'wheel.FL.axle: "fornt" is not one of front, middle, rear; did you mean front?'),
         ("wheel.FL.gear_ratio=24:1", 'wheel.FL.gear_ratio: "24:1" is not a number'),
         ("wheel.FL.torque=7", 'wheel.FL.torque: 7 is not "Message.Signal", nor a table with signal, sign, at,'),
         ("wheel.FL.speed=Speed", 'wheel.FL.speed.signal: "Speed" is not "Message.Signal", the names of a message and'),

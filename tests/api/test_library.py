@@ -187,7 +187,7 @@ def test_an_estimate_prints_every_parameter_with_unit_and_prior(columns):
     text = repr(found)
     assert "rows used          = 18 (left out: none)" in text
     assert "status             = valid" in text
-    assert f"phi:   {np.degrees(found.values['phi']):.2f} +/- " in text
+    assert f"phi:   {np.degrees(found.values['phi']):.1f} +/- " in text
     assert "K:     15 (held)" in text
     assert "kPa" in text
     assert "C(k_phi, n) = +" in text

@@ -16,7 +16,9 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import parse_config
 from soilbus.decision.capability import assess
 from soilbus.decision.traction_loss import idle
-from soilbus.estimation.assembly import model_of, rig_of
+from soilbus.estimation.assembly import model_of, rig_of, with_disengaged
+from soilbus.estimation.instrumentation import completed, recompleted
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import Intake
@@ -25,6 +27,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
+from soilbus.trials.windows import bins_of
 from tests.lab.fakes import feed_message
 
 TRUTH = reference_configuration(path=REFERENCES["tractor-2wd"])
@@ -95,3 +98,30 @@ def test_a_front_axle_stays_disengaged_while_its_speeds_are_silent():
     silent = replace(window, speed=np.where(rig.front, np.nan, window.speed))
     for before in (apart, np.zeros(4, bool)):
         assert idle(silent, rig, -np.inf, before).tolist() == before.tolist()
+
+
+def test_a_disengaged_axle_has_the_rows_of_one_that_is_configured_to_roll_freely():
+    config = with_a_shaft_to_both_axles()
+    wheels = [w.model_copy(update={"driven": w.axle == "rear"}) for w in config.wheel]
+    free = config.model_copy(update={"wheel": wheels})
+    channels, soil = simulate(TRUTH, excited("loam", 10.5), 3).channels, soil_named("loam")
+    engaged, configured = rig_of(config), rig_of(free)
+    rig = with_disengaged(config, engaged, engaged.front)
+    given = completed(bins_of(config, channels).window(0.0, 10.0), engaged)
+    ours = ObservationModel(recompleted(given, engaged, rig), rig, model_of(config), 0.2)
+    other = ObservationModel(bins_of(free, channels).window(0.0, 10.0), configured, model_of(free), 0.2)
+    assert ours.gain_names == other.gain_names
+    assert ours.gain_std == pytest.approx(other.gain_std)
+    assert ours.n_rows == other.n_rows
+    one, two = (p.linearise(soil, np.zeros(len(p.gain_std)), p.start(soil)) for p in (ours, other))
+    assert one.rows == pytest.approx(two.rows, rel=1e-9, abs=1e-9)
+    assert one.weighed == pytest.approx(two.weighed, rel=1e-9, abs=1e-12)
+    assert one.chi2 == pytest.approx(two.chi2)
+
+
+def test_nothing_disengaged_leaves_rig_and_window_as_they_are():
+    config = with_a_shaft_to_both_axles()
+    rig = rig_of(config)
+    assert with_disengaged(config, rig, np.zeros(4, bool)) is rig
+    window = completed(bins_of(config, simulate(TRUTH, excited("loam", 10.5), 3).channels).window(0.0, 10.0), rig)
+    assert recompleted(window, rig, rig) is window

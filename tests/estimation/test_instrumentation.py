@@ -112,11 +112,11 @@ def machine(request, tmp_path):
     return configured(tmp_path, text), rows
 
 
-def window_of(config, rig, seconds=6.0):
-    """Bins of a drive by the model, on a swinging slope."""
+def window_of(config, rig, seconds=6.0, swing=1.0):
+    """Bins of a drive by the model; slope and acceleration swing besides, and its draft does not follow them."""
     t = np.arange(0.05, seconds, 0.1)
     truth = modelled_drive(config, rig, t)
-    truth |= {"pitch": 0.05 * np.sin(t), "acceleration": 0.2 * np.cos(t)}
+    truth |= {"pitch": 0.05 * swing * np.sin(t), "acceleration": 0.2 * swing * np.cos(t)}
     front, rear = axle_loads(rig.chassis, truth["draft"], truth["pitch"], truth["acceleration"])
     truth["load"] = np.where(rig.front[:, None], front / rig.front.sum(), rear / (~rig.front).sum())
     mean = np.full((len(t), len(rig.channels)), np.nan)
@@ -315,7 +315,7 @@ def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     config = configured(tmp_path, rear_driven())
     rig = rig_of(config)
     truth = modelled_drive(config, rig, np.arange(0.05, 6.0, 0.1))
-    problem = ObservationModel(window_of(config, rig), rig, model_of(config), 0.2)
+    problem = ObservationModel(window_of(config, rig, swing=0.0), rig, model_of(config), 0.2)
     fit = fit_window(problem, prior_of(config))
     assert fit is not None
     assert fit.converged
@@ -325,9 +325,8 @@ def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     left = rig.wheels.index("FL")  # it has no speed sensor
     assert slip[:, left].mean() == pytest.approx(true.mean(), abs=0.02)  # side loads that swing are not measured
     assert slip[:, left] == pytest.approx(true, abs=0.06)
-    tan_phi = fit.reported.posterior.tan_phi()
-    # side loads that swing unseen: more than two deviations off
-    assert tan_phi.value == pytest.approx(np.tan(prior_of(config).median[3]), abs=0.06)
+    tan_phi = fit.posterior.tan_phi()
+    assert tan_phi.value == pytest.approx(np.tan(prior_of(config).median[3]), abs=0.5 * tan_phi.std)
 
 
 def test_the_same_slope_loads_the_same_axle_forward_and_in_reverse(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 
 from soilbus.estimation.multistart import clip_to_prior, fit_warm, fit_window, starting_soils, warm_start
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.standing import STANDING
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
@@ -22,6 +23,11 @@ def deviations(fit, soil):
     std = np.sqrt(np.diag(fit.posterior.log_covariance))
     free = std > 0.0
     return np.log(np.asarray(fit.posterior.soil)[free] / np.asarray(soil)[free]) / std[free]
+
+
+def widths(fit):
+    """Standard deviations of bearing pressure and tan phi."""
+    return [quantity.std for quantity in (fit.posterior.bearing_pressure(0.02, 0.3), fit.posterior.tan_phi())]
 
 
 def changed(window: Window, **changes) -> Window:
@@ -73,15 +79,20 @@ def test_errors_are_as_large_as_the_posterior_reports(simulated):
     assert np.median(spread, axis=0).max() < 0.03  # and they are small
 
 
-def test_fits_from_unlike_soils_end_at_the_same_optimum(wet_clay, wet_clay_fit):
-    problem, prior = wet_clay.problem(), wet_clay.prior
+@pytest.mark.parametrize("seed", [50, 51, 52, 53])
+def test_fits_from_unlike_soils_end_at_the_same_optimum(seed, simulated):
+    """A descent ends where 0.1 sd are left: ends differ by no more, and widths by what the curvature changes there."""
+    case = simulated(SOILS["wet_clay"], seed)
+    problem, prior = case.problem(), case.prior
+    one = fit_window(problem, prior)
+    width = widths(one)
     unlike = ("loam", "clayey_soil_38", "dry_sand", "heavy_clay_40", "wet_clay")
     for start in (Soil(*prior.median), *(clip_to_prior(prior, SOILS[name]) for name in unlike)):
         fit = fit_from_soil(problem, prior, start)
         assert fit.converged
-        assert fit.neg2_log_posterior == pytest.approx(wet_clay_fit.neg2_log_posterior, abs=0.01)
-        assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 0.05
-        assert fit.posterior.log_covariance == pytest.approx(wet_clay_fit.posterior.log_covariance, rel=0.01, abs=1e-6)
+        assert np.abs(deviations(fit, one.posterior.soil)).max() < 0.1
+        assert fit.neg2_log_posterior == pytest.approx(one.neg2_log_posterior, abs=0.1)
+        assert widths(fit) == pytest.approx(width, rel=0.1)
 
 
 def test_a_warm_start_from_another_window_ends_at_the_optimum_of_a_cold_fit(wet_clay, wet_clay_fit, simulated):
@@ -264,8 +275,9 @@ def test_a_wrong_gain_is_estimated_as_a_gain(wet_clay, wet_clay_fit):
     fit = fit_window(wet_clay.problem(changed(wet_clay.window, load=off)), wet_clay.prior)
     names = wet_clay.problem().gain_names
     change = fit.gains - wet_clay_fit.gains
-    assert names[int(np.argmax(change))] == "load.RL"
-    assert 0.005 < change.max() < 0.02
+    of_sensors = change[: names.index(STANDING[0])]
+    assert names[int(np.argmax(of_sensors))] == "load.RL"
+    assert 0.005 < of_sensors.max() < 0.02
 
 
 def test_a_wheel_that_no_entry_angle_carries_has_no_sinkage(wet_clay, wet_clay_fit):

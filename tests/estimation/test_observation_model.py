@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
+from soilbus.estimation.standing import STANDING, wheel_inertia
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -38,12 +39,23 @@ def cost_of_instant(window: Window, rig: Rig, i: int, soil: Soil, gains: dict[st
     sd |= {q: sd[q] / (1.0 + g) for q, g in gain.items()}  # of the reading, scaled back to the truth
 
     def corrected(quantity: str) -> np.ndarray:
-        return getattr(window, quantity)[i] / (1.0 + gain[quantity])
+        value, name = getattr(window, quantity), f"lateness.{quantity}"
+        late = gains[name] * slope_of(value) if name in gains else 0.0
+        return value[i] / (1.0 + gain[quantity]) + late
 
-    seen = np.concatenate([corrected("load"), corrected("speed")])
+    def slope_of(values: np.ndarray) -> np.ndarray:
+        return np.gradient(values, window.t, axis=0)[i]
+
+    kinematic = 1.0 - window.ground_speed[:, None] / (rig.radius * window.speed)
+    relaxed = kinematic[i] - gains.get("relaxation_length", 0.0) / window.ground_speed[i] * slope_of(kinematic)
+    by_slip = rig.radius * window.speed[i] ** 2 / window.ground_speed[i]
+    seen = np.concatenate([corrected("load"), corrected("speed") + by_slip * (relaxed - kinematic[i])])
     ground = corrected("ground_speed")
+    speeding_up = gains.get("wheel_inertia", 0.0) * wheel_inertia(rig) * slope_of(window.speed)
+    torque_read = corrected("torque") - speeding_up
     chassis = rig.chassis
     slope = GRAVITY * np.sin(window.pitch[i]) + window.acceleration[i]
+    slope += gains.get("lateness.acceleration", 0.0) * slope_of(window.acceleration)
     demand = corrected("draft") + chassis.mass * slope
     slope_sd = np.hypot(GRAVITY * np.cos(window.pitch[i]) * sd["pitch"], sd["acceleration"])
     demand_sd = np.hypot(sd["draft"], chassis.mass * slope_sd)
@@ -54,7 +66,7 @@ def cost_of_instant(window: Window, rig: Rig, i: int, soil: Soil, gains: dict[st
         """Of latents (..., 2 W + 1) in their standard deviations."""
         latent = start + x * size
         pull, torque, z = explicit(rig, soil, latent[..., :W], latent[..., W : 2 * W], latent[..., 2 * W])
-        rows = [x, (corrected("torque") - torque) / sd["torque"], ((demand - pull) / demand_sd)[..., None]]
+        rows = [x, (torque_read - torque) / sd["torque"], ((demand - pull) / demand_sd)[..., None]]
         parts = np.concatenate([*rows, (window.sinkage[i] - z) / sd["sinkage"]], axis=-1)
         return parts[..., known]
 
@@ -88,6 +100,7 @@ def few(simulated):
     problem = ObservationModel(window, case.rig, MODEL, 0.2)
     soil = Soil(*(np.asarray(case.soil) * np.exp(rng.normal(0.0, 0.03, 6))))
     gains = problem.gain_std * rng.standard_normal(len(problem.gain_std))
+    gains[-len(STANDING) :] *= 0.1  # slopes between instants seconds apart are no motion of wheels
     return window, case.rig, problem, soil, gains
 
 
@@ -106,6 +119,8 @@ def test_chi_square_is_the_least_sum_of_squares_over_the_latents(few):
 def test_gradients_are_those_of_the_least_sum_of_squares(few):
     # By the envelope theorem the derivative of the least cost is 2 J' S^-1 r at the best latents.
     _, _, problem, soil, gains = few
+    sensors = problem.layout.standing.start
+    gains = np.where(np.arange(len(gains)) < sensors, gains, 0.0)
     at = converged(problem, soil, gains)
     gradient = 2.0 * at.weighed.T @ at.rows[:, 0]
     assert gradient[0] == pytest.approx(2.0 * at.chi2)
@@ -113,7 +128,8 @@ def test_gradients_are_those_of_the_least_sum_of_squares(few):
         h = 2e-4 * soil[k]
         up, down = (total_cost(few, soil._replace(**{name: soil[k] + s * h}), gains) for s in (1, -1))
         assert gradient[1 + k] * soil[k] == pytest.approx((up - down) / (2 * h) * soil[k], rel=1e-4, abs=1e-4), name
-    for way in np.random.default_rng(1).standard_normal((2, len(gains))) * problem.gain_std:
+    drawn = np.random.default_rng(1).standard_normal((2, sensors))
+    for way in np.pad(drawn, ((0, 0), (0, len(gains) - sensors))) * problem.gain_std:
         numeric = (total_cost(few, soil, gains + 0.05 * way) - total_cost(few, soil, gains - 0.05 * way)) / 0.1
         assert gradient[7:] @ way == pytest.approx(numeric, rel=2e-3)
 
@@ -194,8 +210,9 @@ def test_gains_are_named_in_the_order_of_their_columns(few):
         *(f"{q}.{w}" for q in GAIN_QUANTITIES[:3] for w in rig.wheels),
         "ground_speed",
         "draft",
+        *STANDING,
     ]
-    assert problem.gain_std == pytest.approx([0.005] * 8 + [0.0015] * 4 + [0.002, 0.005])
+    assert problem.gain_std[:14] == pytest.approx([0.005] * 8 + [0.0015] * 4 + [0.002, 0.005])
 
 
 def test_acceleration_from_speed_and_its_variance():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from soilbus.estimation.model_form import FormPosterior
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior, tyre_modulus
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
@@ -151,8 +152,31 @@ def test_an_added_covariance_adds_up_and_never_exceeds_the_prior():
     assert np.all(np.linalg.eigvalsh(huge - small) > -1e-6)
     unchanged = posterior.with_added_covariance(np.zeros((6, 6)), prior).log_covariance
     assert unchanged == pytest.approx(own, rel=1e-6, abs=1e-12)
-    shift = 0.3 * prior.log_std
-    about = posterior.with_added_covariance(by @ by.T, prior, shift).log_covariance
-    assert about == pytest.approx(small + np.outer(shift, shift))
-    far = posterior.with_added_covariance(1e6 * by @ by.T, prior, 5.0 * prior.log_std).log_covariance
-    assert np.diag(far) == pytest.approx(prior.log_std**2)  # nothing is known less than beforehand
+
+
+def test_a_posterior_over_two_forms_of_the_contact_has_their_mean_and_covariance():
+    """Against draws: of the configured form, or as often as the shift of the mean says of Gaussian form parameters."""
+    rng = np.random.default_rng(6)
+    prior = SoilPrior(np.ones(6), np.array([2.0, 1.5, 0.0, 1.4, 1.6, 1.3]))
+    root = 0.05 * rng.standard_normal((6, 6)) * (prior.log_std > 0.0)[:, None]
+    by_form = 0.5 * rng.standard_normal((9, 4)) * np.concatenate([prior.log_std > 0.0, np.ones(3)])[:, None]
+    spread, mean = 0.1 * rng.standard_normal((4, 4)), np.array([-0.2, 0.1, 0.15, 0.3])
+    form = FormPosterior(by_form, mean, spread @ spread.T)
+    n, is_open = 400_000, form.log_shift[0] / (by_form[0] @ mean)
+    assert 0.0 < is_open < 1.0
+    of_form = np.where(rng.random(n) > is_open, 0.0, mean[:, None] + spread @ rng.standard_normal((4, n)))
+    drawn = root @ rng.standard_normal((6, n)) + by_form[:6] @ of_form
+    found = Posterior(Soil(*np.ones(6)), root @ root.T).with_added_covariance(
+        form.log_covariance, prior, form.log_shift
+    )
+    sd = np.sqrt(np.diag(found.log_covariance))
+    assert np.log(found.soil) == pytest.approx(drawn.mean(axis=1), abs=0.01 * sd.max())
+    assert found.log_covariance == pytest.approx(np.cov(drawn), abs=0.01 * sd.max() ** 2)
+
+
+def test_a_shift_never_exceeds_the_prior_sd():
+    prior = SoilPrior(np.ones(6), np.array([0.8, 0.5, 0.0, 0.4, 0.6, 0.3]))
+    posterior = Posterior(Soil(*np.ones(6)), np.diag(0.01 * prior.log_std**2))
+    for side in (-1.0, 1.0):
+        far = posterior.with_added_covariance(np.zeros((6, 6)), prior, side * 5.0 * np.ones(6))
+        assert np.log(far.soil) == pytest.approx(side * prior.log_std)

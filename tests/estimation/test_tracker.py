@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import TrackerOutput, TrackerState
+from soilbus.estimation.soil_state import TrackerState
+from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -110,21 +111,35 @@ def test_no_valid_window_near_a_border_is_wrong(first, second, at, transition, s
     assert valid_after >= 1
 
 
-def test_a_soil_found_afresh_is_another_one_from_where_its_data_begin():
-    # Nothing but failed windows in between, so that no border was seen.
+def two_visits(first: str, second: str, seed: int):
+    """The tracker and its results of a second drive; nothing but a window without speeds lies between the two."""
     config = reference_configuration()
     tracker = tracker_of(config)
-    for soil, first in (("loam", 0.0), ("wet_clay", 30.0)):
+    for soil, start in ((first, 0.0), (second, 30.0)):
         scenario = Scenario(13.0, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
         results = []
-        for window, end in windows(config, simulate(config, scenario, 2)):
-            late = replace(window, t=window.t + first)
-            results.append(tracker.estimate(late, end + first))
-        empty = replace(window, t=window.t + first, ground_speed=np.full(len(window.t), np.nan))
-        assert tracker.estimate(empty, end + first).fit is None
+        for window, end in windows(config, simulate(config, scenario, seed)):
+            results.append(tracker.estimate(replace(window, t=window.t + start), end + start))
+        empty = replace(window, t=window.t + start, ground_speed=np.full(len(window.t), np.nan))
+        assert tracker.estimate(empty, end + start).fit is None
+    return tracker, results
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_soil_found_afresh_is_another_one_from_where_its_data_begin(seed):
+    # No border was seen; by the prior of the loam residuals are twice, and not several times, what they were.
+    tracker, results = two_visits("loam", "wet_clay", seed)
     assert [r.state for r in results] == [TrackerState.NEW_SOIL] + [TrackerState.STEADY] * (len(results) - 1)
     assert all(abs(off(r, "wet_clay")) < 3.5 for r in results)
     assert tracker.state.transition.end == pytest.approx(30.0, abs=0.2)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_same_soil_after_a_pause_is_the_same_soil(seed):
+    tracker, results = two_visits("loam", "loam", seed)
+    assert {r.state for r in results} == {TrackerState.STEADY}
+    assert tracker.state.transition is None
+    assert all(abs(off(r, "loam")) < 3.5 for r in results)
 
 
 def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
@@ -139,11 +154,12 @@ def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
             assert result.mismatch
 
 
-def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
-    config = reference_configuration(["estimator.soil_drift=0.005"])  # what may drift by 3 % is soon forgotten
+@pytest.mark.parametrize("seed", [1, 2])
+def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said(seed):
+    config = reference_configuration(["estimator.soil_drift=0.0005"])  # what drifts is soon forgotten and ends wide
     scenario = Scenario(200.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     tracker = tracker_of(config)
-    results = [tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, 1))]
+    results = [tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, seed))]
     assert {r.state for r in results} == {TrackerState.STEADY}
     assert not any(r.mismatch for r in results)
     away = np.array([off(r, "loam") for r in results])
@@ -152,7 +168,7 @@ def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
     assert np.abs(away).max() < 3.5
     # The windows before add information: the last estimates have smaller sd than the first.
     std = [r.fit.posterior.bearing_pressure(Z_REF, B_REF).std for r in results]
-    assert np.median(std[-20:]) < 0.9 * np.median(std[:5])
+    assert np.median(std[-20:]) < 0.8 * np.median(std[:5])
 
 
 def test_a_window_that_fails_leaves_what_is_known_alone():

@@ -9,7 +9,7 @@ import pytest
 
 from soilbus.decision.traversability import Status
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.tracker import SearchBudget
+from soilbus.estimation.search_budget import SearchBudget
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -64,6 +64,16 @@ def test_what_is_well_again_is_soon_found(drive):
     results = [estimator.solve(with_draft(task, -1.0 if i < healed else 1.0)) for i, task in enumerate(drive)]
     first = next(i for i, r in enumerate(results) if r.status is Status.VALID)
     assert healed <= first <= healed + 6
+
+
+def test_windows_that_no_soil_explains_say_nothing_of_the_sensors(drive):
+    """What is learned as noise from them hides a fault of the same size that comes later."""
+    estimator, sound, bad = WindowEstimator(CONFIG), WindowEstimator(CONFIG), 10
+    for i, task in enumerate(drive[: bad + 6]):
+        result, expected = estimator.solve(with_draft(task, -1.0 if i < bad else 1.0)), sound.solve(task)
+    assert result.status is Status.VALID
+    assert result.noise_factors == pytest.approx(expected.noise_factors, rel=0.3)
+    assert result.bearing.std < 1.3 * expected.bearing.std
 
 
 def test_good_windows_never_meet_the_budget(drive):

@@ -7,14 +7,7 @@ from dataclasses import replace
 import pytest
 
 from soilbus.estimation.change_detection import ChangeStatistic, Transition
-from soilbus.estimation.tracker import (
-    ChangePoint,
-    Reason,
-    Shown,
-    SoilState,
-    TrackerState,
-    next_state,
-)
+from soilbus.estimation.soil_state import ChangePoint, Reason, Shown, SoilState, TrackerState, next_state
 
 LENGTH = 10.0
 SHARP, GRADUAL = Transition(20.0, 20.5, 1.3), Transition(20.0, 24.0, 1.3)

@@ -20,8 +20,6 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.config.model import Axle, Config, Signal
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95, SoilPrior
@@ -108,7 +106,7 @@ def errors(task: Task) -> Array | None:
     fit = fit_window(problem, prior)
     if fit is None or not fit.converged:
         return None
-    posterior = with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit).reported.posterior
+    posterior = fit.posterior
     z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
     pressure, tan_phi = posterior.bearing_pressure(z_ref, b_ref), posterior.tan_phi()
     log_n = np.log(posterior.soil.n / soil.n) / np.sqrt(posterior.log_covariance[2, 2])

@@ -79,7 +79,7 @@ def tracker_of(config: Config) -> Tracker:
     s = config.estimator
     return Tracker(
         rig_of(config), prior_of(config), model_of(config),
-        Settings(s.window, s.min_speed, s.max_turn, s.max_chi2, s.soil_drift, hop=s.hop),
+        Settings(s.window, s.min_speed, s.max_turn, s.soil_drift, hop=s.hop),
     )  # fmt: skip
 
 

@@ -145,7 +145,7 @@ def least_sd(config: Config, driven: Drive, t: float) -> float:
     rig = replace(rig, noise={name: noise._replace(gain=0.0) for name, noise in rig.noise.items()})
     store = bins_of(config, exact(recording, config, recording.channels))
     border = Transition(driven.on, driven.on, driven.left - driven.on)
-    window = without_transition(store.window(driven.on, end), border, rig.front)
+    window = without_transition(store.window(driven.on, end), border, rig.ahead)
     settings = config.estimator
     problem = ObservationModelWithEffects(window, rig, model_of(config), settings.min_speed, settings.max_turn)
     bound = cramer_rao(problem, new_soil_prior(prior_of(config)), driven.soils[1].parameters())

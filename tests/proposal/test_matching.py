@@ -258,6 +258,60 @@ def test_a_letter_names_an_axle_where_the_other_axle_has_the_same_name(tmp_path,
     assert alone["axle.?.torque"] == "MCU_R_Tq.MCU_R_TqEst"  # R may be the right one, or a revision
 
 
+SIX = ("FL", "FR", "ML", "MR", "RL", "RR")
+NUMBERED = ("1L", "1R", "2L", "2R", "3L", "3R")
+SPELT = {
+    "corners": [f"WhlSpd{w}" for w in SIX],
+    "numbers": [f"Whl_{w}_Speed" for w in NUMBERED],
+    "letters first": [f"W{w}Spd" for w in NUMBERED],
+    "sides first": [f"WheelSpeed_{w[::-1]}" for w in NUMBERED],
+    "words": [f"WheelSpeed{a}{s}" for a in ("Front", "Mid", "Rear") for s in ("Left", "Right")],
+    "axles": [f"Axle{a}{s}WheelSpeed" for a in "123" for s in ("Left", "Right")],
+}
+"""Six wheel speeds in the spellings of several makers, from the front left to the rear right one."""
+
+
+@pytest.mark.parametrize("style", SPELT)
+def test_six_wheels_are_found_however_their_axles_are_called(style, tmp_path, capsys):
+    names = SPELT[style]
+    first, others = dict.fromkeys(names[:4], "rad/s"), dict.fromkeys(names[4:], "rad/s")
+    raw = proposed(capsys, a_dbc(tmp_path / "six.dbc", [(1, "Ebs1", first), (2, "Ebs2", others)]))
+    assert [axle["name"] for axle in raw["axle"]] == ["front", "middle", "rear"]
+    assert [(wheel["name"], wheel["axle"]) for wheel in raw["wheel"]] == list(
+        zip(SIX, ("front", "front", "middle", "middle", "rear", "rear"), strict=True)
+    )
+    found = [wheel["speed"].partition(".")[2] for wheel in raw["wheel"]]
+    assert found == names
+
+
+def test_four_axles_keep_their_numbers(tmp_path, capsys):
+    messages = [(n, f"Axle{n}", {f"WhlSpd{n}{side}": "rad/s" for side in "LR"}) for n in range(1, 5)]
+    raw = proposed(capsys, a_dbc(tmp_path / "eight.dbc", messages))
+    assert [axle["name"] for axle in raw["axle"]] == ["1", "2", "3", "4"]
+    assert [wheel["name"] for wheel in raw["wheel"]] == ["1L", "1R", "2L", "2R", "3L", "3R", "4L", "4R"]
+    assert raw["wheel"][5]["speed"] == "Axle3.WhlSpd3R"
+
+
+def test_a_load_pin_is_a_load_by_its_comment_and_an_axle_by_its_number(tmp_path, capsys):
+    messages = [(1, "LdPins", {f"Pin{w}": "N" for w in SIX[:4]}), (2, "LdPins2", {f"Pin{w}": "N" for w in SIX[4:]})]
+    pins = a_dbc(tmp_path / "pins.dbc", messages)
+    comments = [f'CM_ SG_ {1 + (w[0] == "R")} Pin{w} "Vertical load of wheel {w}";' for w in SIX]
+    pins.write_text("\n".join([pins.read_text(), *comments, ""]))
+    found = mapped(proposed(capsys, pins))
+    assert found == {f"wheel.{w}.load": f"LdPins{'2' * (w[0] == 'R')}.Pin{w}" for w in SIX}
+    scale = [(1, "Scale", {f"Axle{n}Load": "kN" for n in (1, 2, 3)})]
+    found = mapped(proposed(capsys, a_dbc(tmp_path / "scale.dbc", scale)))
+    assert found == {f"axle.{name}.load": f"Scale.Axle{n}Load" for n, name in enumerate(("front", "middle", "rear"), 1)}
+
+
+def test_a_middle_or_a_number_alone_makes_no_third_axle(tmp_path, capsys):
+    speeds = {f"WhlSpd{w}": "rad/s" for w in ("FL", "FR", "RL", "RR")}
+    messages = [(1, "Ebs", speeds), (2, "Motor_ML", {"Axle1Load": "N"})]
+    raw = proposed(capsys, a_dbc(tmp_path / "four.dbc", messages))
+    assert [wheel["name"] for wheel in raw["wheel"]] == ["FL", "FR", "RL", "RR"]
+    assert "axle" not in raw
+
+
 def test_what_only_a_unit_fits_is_listed_and_a_difference_of_speeds_is_no_speed(tmp_path, capsys):
     assert main(["init", "--dbc", str(a_dbc(tmp_path / "unnamed.dbc", UNNAMED))]) == 0
     text = capsys.readouterr().out

@@ -92,7 +92,7 @@ def test_largest_draft_is_that_of_the_first_generator_where_the_wheel_is_the_sam
         wheels=WHEELS,
         radius=np.array([w.radius for w in config.wheel]),
         width=np.array([w.width for w in config.wheel]),
-        front=np.array([w.axle == "front" for w in config.wheel]),
+        ahead=np.array([1.0 if w.axle == "front" else 0.0 for w in config.wheel]),
         chassis=chassis_of(config),
         noise={quantity: SensorNoise() for quantity in ("torque", "load", "speed")},
     )

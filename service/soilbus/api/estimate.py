@@ -266,13 +266,14 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     config = _configuration(rig, columns)
     found = _of_bed(runs_of_columns(config, columns, SOURCE), run)
     (result,) = replay_runs(config, [found])
-    if result.posterior is None or result.bearing is None:
+    bearing = result.bearing
+    if result.posterior is None or bearing is None or bearing.std > bearing.value:
         raise NotFitted(f"no soil describes the {len(found.window.t)} rows ({result.reason})")
     settings = config.estimator
     return SoilEstimate(
         posterior=result.posterior,
         prior={name: (p.value, p.std) for name, p in config.soil_prior.items()},
-        bearing_pressure=result.bearing,
+        bearing_pressure=bearing,
         z_ref=settings.z_ref,
         b_ref=settings.b_ref,
         status=str(result.status),

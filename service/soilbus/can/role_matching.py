@@ -35,16 +35,19 @@ __all__ = [
     "Candidate",
     "Slot",
     "assigned",
+    "axles_of",
     "candidates",
     "described",
     "dimensions_of",
     "is_word_in",
 ]
 
-WHEELS = ("FL", "FR", "RL", "RR")
-"""Places of wheels: front or rear, left or right."""
-AXLES = ("front", "rear", "both")
-"""Places of axles; `both` for one motor that drives front and rear."""
+_LETTERS = {"front": "F", "middle": "M", "rear": "R", **{str(k): str(k) for k in range(1, 5)}}
+"""Letter of the wheels of each axle, front to rear; four axles have numbers."""
+AXLES = (*_LETTERS, "both")
+"""Places of axles; `both` for one motor that drives all of them."""
+WHEELS = frozenset(letter + side for letter in _LETTERS.values() for side in "LR")
+"""Places of wheels: an axle's letter, and L or R."""
 ASSERTED = 1.0
 """Score from which a match is asserted: the unit fits and at least one strong word of the role stands in a name."""
 MARGIN = 0.3
@@ -78,7 +81,8 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "actual": "act fbk feedback fb measured meas estimated est real", "pto": "powertakeoff", "engine": "eng ice",
     "brake": "brk braking", "vehicle": "veh machine motion", "odometer": "odo", "valid": "ok qualifier vld",
     "state": "status stat", "current": "curr cur amps iq",
-    "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
+    "front": "frnt frt fnt fwd", "middle": "mid mitte",
+    "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
 }  # fmt: skip
 _GERMAN: Mapping[str, str] = {
     "torque": "moment mom drehmoment drehmom",
@@ -104,8 +108,11 @@ for _spelling in _OTHER.split():
     _WORDS.setdefault(_spelling, frozenset({_spelling}))
 
 _CORNERS = {"fl": "FL", "lf": "FL", "fr": "FR", "rf": "FR", "rl": "RL", "lr": "RL", "rr": "RR"} | {
-    "vl": "FL", "vr": "FR", "hl": "RL", "hr": "RR"
+    "vl": "FL", "vr": "FR", "hl": "RL", "hr": "RR", "ml": "ML", "mr": "MR"
 }  # fmt: skip
+_NUMBERED = {
+    a: f"{k}{side}" for k in range(1, 5) for side in "LR" for a in (f"{k}{side}".casefold(), f"{side}{k}".casefold())
+}
 _AXLE_LETTERS = {"f": ("r", "front"), "r": ("f", "rear"), "v": ("h", "front"), "h": ("v", "rear")}
 """Letter of an axle: its counterpart, and the axle."""
 _GROUPS: Mapping[int, frozenset[str]] = {
@@ -248,7 +255,17 @@ def candidates(database: Database) -> list[Candidate]:
         Messages of the vehicle's bus.
     """
     names = frozenset(name for m in database.messages for name in (m.name, *(s.name for s in m.signals)))
-    return [c for m in database.messages for s in m.signals for c in _of_signal(m, s, names)]
+    said = {place for m in database.messages for s in m.signals for text in _texts(m, s) if (place := _place(text))}
+    known = _known_places(said)
+    return [c for m in database.messages for s in m.signals for c in _of_signal(m, s, names, known)]
+
+
+def axles_of(assignment: Assignment) -> dict[str, tuple[str, str]]:
+    """Names of the axles that an assignment's places are of, front to rear, with the left and the right wheel."""
+    letters = {slot.place[:1] for slot in (*assignment.asserted, *assignment.open)}
+    numbers = [name for name in _LETTERS if name.isdigit()]
+    three = ("front", "middle", "rear") if letters & {"M", "m"} else ("front", "rear")
+    return {name: (_LETTERS[name] + "L", _LETTERS[name] + "R") for name in (numbers if letters & {*numbers} else three)}
 
 
 def assigned(found: Iterable[Candidate]) -> Assignment:
@@ -326,10 +343,28 @@ def is_word_in(name: Candidate | str, *words: str) -> bool:
 # --- one signal ---
 
 
-def _of_signal(message: Message, signal: Signal, names: frozenset[str]) -> list[Candidate]:
+def _texts(message: Message, signal: Signal) -> tuple[str, ...]:
+    return signal.name, message.name, *(message.senders or ()), signal.comment or ""
+
+
+def _known_places(said: set[str]) -> dict[str, str]:
+    """The place that each spelling means in a DBC: M where it has F, M and R, numbers where it has 1 to 3 or 1 to 4."""
+    six = [{letter + side for letter in "FMR" for side in "LR"}, {"front", "middle", "rear"}]
+    known = {place: place for place in said if place[0].casefold() != "m" or any(places <= said for places in six)}
+    numbers = {place[0] for place in said if place[0].isdigit()}
+    names = {3: ("front", "middle", "rear"), 4: ("1", "2", "3", "4")}.get(len(numbers), ())
+    meant = dict(zip("1234", names, strict=False)) if numbers == set("1234"[: len(names)]) else {}
+    for place in said:
+        if place[0].isdigit():
+            name = meant.get(place[0], "")
+            known[place] = _LETTERS[name] + place[1] if name and place[1:] else name
+    return known
+
+
+def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: Mapping[str, str]) -> list[Candidate]:
     comment = signal.comment or ""
-    texts = (signal.name, message.name, *(message.senders or ()), comment)
-    place = next((p for text in texts if (p := _place(text) or _axle_by_letter(text, names))), "")
+    texts = _texts(message, signal)
+    place = next((p for text in texts if (p := known.get(_place(text)) or _axle_by_letter(text, names))), "")
     try:
         unit = unit_of(signal.unit)
     except ValueError:
@@ -392,7 +427,7 @@ def _score(
     if at_wheel:
         against = against - _HITCH  # a load pin is in a wheel's hub, too
         around = around | {"wheel"} if role == "speed" else around
-    is_bare = not own - {"front", "rear", "speed"}  # it only says where, or how fast: the message says what
+    is_bare = not own - {"front", "middle", "rear", "speed"}  # it only says where, or how fast: the message says what
     score = base if unit is not None or dimensions == ("",) else -_NO_UNIT
     for word, weight in weights.items():
         share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
@@ -490,18 +525,21 @@ def _words(text: str) -> frozenset[str]:
 
 
 def _place(text: str) -> str:
-    """FL, FR, RL, RR; front, rear, both; or "" where a text says no place, or several."""
+    """FL to RR, 1L to 4R; front, middle, rear, 1 to 4, both; or "" where a text says no place, or several."""
     tokens = _tokens(text)
-    along = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("front", "rear")}
+    along = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("front", "middle", "rear")}
     across = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("left", "right")}
     if not along:  # "FrLft", "RrAxl"
         axles = {here for here, following in pairwise(tokens) if "axle" in _WORDS.get(following, ())}
         along = {_AXLE_LETTERS[t[0]][1] for t in (tokens if across else axles) if t in ("fr", "rr")}
+    beside = [(a, b) for pair in pairwise(tokens) for a, b in (pair, pair[::-1]) if "axle" in _WORDS.get(a, ())]
+    along = along or {number for _, number in beside if number in _LETTERS}
     if len(along) == len(across) == 1:
-        return {"front": "F", "rear": "R"}[min(along)] + {"left": "L", "right": "R"}[min(across)]
+        return _LETTERS[min(along)] + {"left": "L", "right": "R"}[min(across)]
     corners = {_CORNERS[t] for t in tokens if t in _CORNERS}
-    letters = (a + b for a, b in pairwise(tokens) if len(a) == len(b) == 1)
+    letters = [a + b for a, b in pairwise(tokens) if len(a) == len(b) == 1]
     corners |= {_CORNERS[pair] for pair in letters if pair in _CORNERS}
+    corners = corners or {_NUMBERED[pair] for pair in letters if pair in _NUMBERED}
     if len(corners) == 1 and not along and not across:
         return min(corners)
     if corners or across:

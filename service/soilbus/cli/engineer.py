@@ -91,7 +91,7 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     from soilbus.report.advice import of_use
 
     useful = of_use(results)
-    weak = sum(result.reason.startswith(("not_excited", "ambiguous")) for result in useful)
+    weak = sum(result.reason.startswith("not_excited") for result in useful)
     if not useful or (args.manoeuvre_out is None and 2 * weak < len(useful)):
         return ""
     now = useful[-1].posterior

@@ -12,6 +12,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -148,6 +149,8 @@ def check(args: argparse.Namespace) -> None:
         for line in faults:
             say(line)
         print("" if log is None else log_report(log, found), survey_report(found), sep="")
+        if log is not None and str(args.log) != "-" and not faults:
+            print(_machine_of(args.log, config))
         warnings += ([log.note] if log is not None and log.note else []) + found.warnings
     print(of_configuration, end="")
     if args.settings:
@@ -178,6 +181,22 @@ def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | S
             return survey(config, database, _counted(log.frames(), step)), log
     except (LogError, BusError) as error:
         raise WorkError(str(error)) from None
+
+
+def _machine_of(log: Path, config: Config) -> str:
+    """Return what the estimator finds out of the machine in the first windows of a recording."""
+    from soilbus.can.dbc_files import load_databases
+    from soilbus.offline.replay import replay
+    from soilbus.pipeline.pipeline import Pipeline
+    from soilbus.report.windows import machine_line
+
+    windows = replay(Pipeline(config, load_databases(config)), [log], on_fault=lambda _: None)
+    line = machine_line(list(islice(windows, FIRST_WINDOWS)))
+    return line or "not checkable from this log: delays, inertia and relaxation, for no window has an estimate"
+
+
+FIRST_WINDOWS = 60
+"""Windows [1] of a recording in which `check` looks for delays: a minute or two, after which they change little."""
 
 
 def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None) -> Iterator[Frame]:

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -232,7 +233,7 @@ class Vehicle(_Section):
     """Its standard deviation [kg], which `mass = { value, std }` sets; by default 2 % of the mass where a load is not
     measured (driver, half a tank), else 0."""
     wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
-    """Front to rear axle [m]."""
+    """First to last axle [m]."""
     cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
     """Centre of gravity ahead of the rear axle [m]; `{ value, std }` where it is not known well."""
     cg_std: Annotated[NonNegativeFloat, AfterValidator(LENGTH_STD)] | None = None
@@ -290,12 +291,15 @@ class SignalOfAcceleration(Signal):
 class Axle(_Section):
     """What belongs to an axle and not to a wheel: its motor, its differential, a load cell or air spring.
 
-    `both` is the shaft that drives both axles; its differential is the one between the axles.  Torques are of the axle:
-    the sum over its wheels.
+    Axles stand in the order of their tables, from the front to the rear; `front` is always the first and `rear` the
+    last.  `both` is the shaft that drives all axles; its differentials are those between the axles.  Torques are of the
+    axle: the sum over its wheels.
     """
 
-    name: Literal["front", "rear", "both"]
-    """Axle; `both` for a motor or engine that drives front and rear."""
+    name: Name
+    """`front`, `middle`, `rear` or a name of your own; `both` for a motor or engine that drives all axles."""
+    ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(WHEELBASE)] | None = None
+    """Distance [m] of an axle between the first and the last from the last; without, all are equally far apart."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
     """Turns of the shaft for one of the axle's wheels; of `both`: of its motor for one of the shafts to the axles,
     whose own ratios are those of `front` and `rear`."""
@@ -320,9 +324,9 @@ class Wheel(_Section):
     """One wheel and its sensors; only the wheel of a test rig has no axle, and of an axle the left one stands first."""
 
     name: Name
-    """For messages, JSON and frames: FL, FR, RL, RR on a tractor."""
-    axle: Literal["front", "rear"] | None = None
-    """Axle that carries it."""
+    """For messages, JSON and frames: FL, FR, RL, RR on a tractor, ML and MR between them on six wheels."""
+    axle: Name | None = None
+    """Axle that carries it: `front`, `middle`, `rear`, or the name of an [[axle]]."""
     radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
     """Rolling radius [m]."""
     width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
@@ -382,7 +386,7 @@ class Track(_Section):
 
     name: Name
     """For messages, JSON and frames: L, R."""
-    axle: Literal["front", "rear"] | None = None
+    axle: Name | None = None
     """Axle whose place it takes on a half-track or a machine with four tracks."""
     contact_length: Annotated[PositiveFloat, AfterValidator(CONTACT_LENGTH)]
     """On the ground, from the first to the last roller [m]."""
@@ -717,11 +721,18 @@ class Estimator(_Section):
     max_bearing_std: PositiveFloat = 0.10
     """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
     that carries load."""
+    max_draft_std: PositiveFloat = 0.25
+    """Std of the largest draft up to which a window of a vehicle counts as excited, as a share of this draft's size or,
+    where that is more, of a tenth of the weight."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
-    counts as excited."""
-    max_chi2: PositiveFloat = 1.1
-    """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
+    of a test rig counts as excited, and up to which a window shows the soil's strength to the warning."""
+    max_prediction_error: PositiveFloat = 0.25
+    """Error of the torque or pull that the model predicts for data it has not seen, as a share of what is there, above
+    which a window is `model_mismatch`."""
+    max_gain_error: PositiveFloat = 6.0
+    """Gain error of a sensor, in sd of what is configured of it, above which a window is `model_mismatch`: sound
+    multibody drives end at 5.3, those with a wrong weight or draft reach 9 to 20."""
     search_rate: NonNegativeFloat = 4.0
     """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
     the model describes take 1 to 3 in all (field and simulated drives)."""
@@ -908,7 +919,7 @@ class Config(_Section):
     bus: Bus = Bus()
     dbc: Dbc = Dbc()
     vehicle: Vehicle | None = None
-    axle: list[Axle] = Field(default_factory=list, max_length=3)
+    axle: list[Axle] = Field(default_factory=list, max_length=9)
     wheel: list[Wheel] = Field(default_factory=list, max_length=8)
     track: list[Track] = Field(default_factory=list, max_length=4)
     signals: Signals = Signals()
@@ -928,18 +939,25 @@ class Config(_Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _vehicle_on_tracks(cls, value: Any) -> Any:
-        """What follows for [vehicle] from tracks that carry all of it."""
-        if not isinstance(value, Mapping) or value.get("wheel") or not isinstance(value.get("vehicle"), Mapping):
+    def _vehicle_on_one_axle(cls, value: Any) -> Any:
+        """What follows for [vehicle] from tracks, or from the wheels of a single axle, that carry all of it."""
+        if not isinstance(value, Mapping) or not isinstance(value.get("vehicle"), Mapping):
             return value
-        given = value.get("track")
-        tracks = [t for t in (given if isinstance(given, list) else [given]) if isinstance(t, Mapping)]
-        if not tracks or all("axle" in track for track in tracks):
+        wheels, tracks = (
+            [part for part in (given if isinstance(given, list) else [given]) if isinstance(part, Mapping)]
+            for given in (value.get("wheel"), value.get("track"))
+        )
+        names = {str(wheel.get("axle", "front")) for wheel in wheels}
+        if wheels and len(names) == 1 and not tracks and not names & {"front", "middle", "rear"}:
+            key, size, steering = "radius", 2.0, "wheels"
+        elif tracks and not wheels and any("axle" not in track for track in tracks):
+            key, size, steering = "contact_length", 1.0, "skid"
+        else:
             return value
-        lengths = [t["contact_length"] for t in tracks if type(t.get("contact_length")) in (int, float)]
-        usual = [float(length) for length in lengths if CONTACT_LENGTH.low <= length <= CONTACT_LENGTH.high]
-        length = usual[0] if usual else WHEELBASE.high  # then the fault is that of the track alone
-        defaults = {"wheelbase": length, "steering": "skid", "cg_ahead_of_rear_axle": length / 2.0}
+        lengths = [size * part[key] for part in (*wheels, *tracks) if type(part.get(key)) in (int, float)]
+        usual = [length for length in lengths if WHEELBASE.low <= length <= WHEELBASE.high]
+        length = usual[0] if usual else WHEELBASE.high  # then the fault is that of the wheel or track alone
+        defaults = {"wheelbase": length, "steering": steering, "cg_ahead_of_rear_axle": length / 2.0}
         return {**value, "vehicle": defaults | dict(value["vehicle"])}
 
     @model_validator(mode="before")
@@ -998,9 +1016,22 @@ class Config(_Section):
         return self.signals.draft is not None and (self.vehicle is None or self.vehicle.towing != "unknown")
 
     @property
-    def on_tracks(self) -> bool:
-        """Whether tracks carry the whole vehicle."""
-        return bool(self.track) and all(t.axle is None for t in self.track)
+    def axles(self) -> dict[str, float]:
+        """Axles that have wheels or tracks, front to rear, and how far ahead of the last one, over the wheelbase."""
+        of_wheels = [w.axle for w in self.wheel if w.axle is not None]
+        names = [name for name in dict.fromkeys([*(a.name for a in self.axle), *of_wheels]) if name in of_wheels]
+        names.sort(key=lambda name: (name == "rear") - (name == "front"))
+        if len(names) == 1:
+            return {name: float(name != "rear") for name in names}
+        length = WHEELBASE.high if self.vehicle is None else self.vehicle.wheelbase
+        given = {a.name: a.ahead_of_rear_axle / length for a in self.axle if a.ahead_of_rear_axle is not None}
+        return {name: given.get(name, 1.0 - i / (len(names) - 1)) for i, name in enumerate(names)}
+
+    @property
+    def on_one_axle(self) -> bool:
+        """Whether tracks, or the wheels of a single axle of its own name, carry the whole vehicle."""
+        is_whole = bool(self.track) and all(t.axle is None for t in self.track)
+        return is_whole or (len(self.axles) == 1 and not self.axles.keys() & {"front", "middle", "rear"})
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
@@ -1025,6 +1056,14 @@ class Config(_Section):
 
     def _faults_of_axles(self) -> Iterator[str]:
         """A line for each axle that does not go with its wheels, and for each torque that would count twice."""
+        named = list(dict.fromkeys(["front", "middle", "rear", *(a.name for a in self.axle if a.name != "both")]))
+        for w in self.wheel:
+            if w.axle is not None and w.axle not in named:
+                yield (
+                    f'{w.section}.{w.name}.axle: "{w.axle}" is not one of {", ".join(named)}'
+                    f"{did_you_mean(w.axle, named) or '; an axle of another name needs an [[axle]]'}"
+                )
+        yield from self._faults_of_places()
         for axle in self.axle:
             if sum(a.name == axle.name for a in self.axle) > 1:
                 yield f"two axles are named {axle.name}"
@@ -1041,6 +1080,22 @@ class Config(_Section):
             own += [f"axle.{a.name}" for a in self.axle if axle.name == "both" != a.name and a.torque is not None]
             if own:
                 yield f"axle.{axle.name}.torque and {own[0]}.torque are the same torque: leave out one of the two"
+
+    def _faults_of_places(self) -> Iterator[str]:
+        """A line for each axle whose place along the vehicle is missing or out of order."""
+        (*before, _), places = ("", *self.axles), list(self.axles.values())
+        between = before[2:]
+        given = [axle for axle in self.axle if axle.ahead_of_rear_axle is not None]
+        for axle in given:
+            if axle.name not in between:
+                yield f"axle {axle.name}: ahead_of_rear_axle is for axles between the first and the last one"
+        if missing := [name for name in between if given and name not in {axle.name for axle in given}]:
+            yield f"axle {missing[0]}: ahead_of_rear_axle: missing; give it of each axle between the first and last"
+        if any(ahead <= behind for ahead, behind in pairwise(places)):
+            yield (
+                f"the axles {', '.join(self.axles)} must stand from the front to the rear, as their [[axle]] tables do:"
+                " ahead_of_rear_axle must fall from vehicle.wheelbase to 0"
+            )
 
     @model_validator(mode="after")
     def _bins_of_differentials(self) -> Config:

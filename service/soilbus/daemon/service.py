@@ -286,9 +286,9 @@ class Service:
 
     def _take(self, result: WindowResult, ended: float) -> None:
         if result.gaps and not (self.result is not None and self.result.gaps):
-            shown = ", ".join(f"{channel} {chi2:.2f}" for channel, chi2 in result.gaps.items())
+            shown = ", ".join(f"{channel} {100.0 * share:.0f} %" for channel, share in result.gaps.items())
             log.warning(
-                "model_gap: for minutes the model has not described %s (chi-square; 1 is noise); "
+                "model_gap: for minutes the model has predicted %s off; "
                 "record a drive with candump -l and run: soilbus diagnose --config F LOG", shown,
             )  # fmt: skip
         if _first_word(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):

@@ -136,7 +136,7 @@ class Capability:
     limit
         What ends max_draft.
     set_points
-        By axle.
+        Of the front axle, and of all axles behind it together.
     forecast
         None where most likely no slip gives the demand.
     over_slip
@@ -210,7 +210,7 @@ def assess(
         For a rig without a chassis.
     """
     uncertain = UncertainModel.over(model)
-    points = SigmaPoints.of(posterior, uncertain.shifts)
+    points = SigmaPoints.of(posterior, uncertain.shifts, float(rig.width.mean()))
     driven = ~(torque_limit <= 0.0)
     completed = uncertain.of_rows(len(points.soils))
     table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, NEWTON_TOLERANCE, driven)

@@ -1,6 +1,7 @@
 """A posterior of the soil as a few sigma points, and mean and standard deviation of what follows from them.
 
     log soil_d = log mode + L x_d                   x_d: points of `design` along principal directions, d = 1..D
+    log K_L of soil_d = to first order that of them, K_L = k_c / b + k_phi; k_c at most all of it
     f(draw) = sum_d share(draw, d) f(soil_d)        response surface (Box & Wilson 1951): polynomial through them
     mean, std of g(f)                               over 256 draws of standard normals with exact low moments
 
@@ -47,7 +48,11 @@ FIRST_AXIS_DEGREE = 6
 """Degree of the polynomial along the first direction."""
 _HELD_VARIANCE_RATIO = 1e-14
 """Variance of a direction over the largest one, below which the direction counts as known exactly."""
-_PHI = Soil._fields.index("phi")
+LEAST_K_PHI = 1e-3
+"""Least share of K_L that k_phi has at a point [1]: no force shows less."""
+MAX_STEP = 50.0
+"""Largest change of a logarithm [1], whose exponential is finite."""
+_K_C, _K_PHI, _PHI = (Soil._fields.index(name) for name in ("k_c", "k_phi", "phi"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +75,7 @@ class SigmaPoints:
     mirror: NDArray[np.intp]
 
     @classmethod
-    def of(cls, posterior: Posterior, shifts: Array | None = None) -> SigmaPoints:
+    def of(cls, posterior: Posterior, shifts: Array | None = None, width: float | None = None) -> SigmaPoints:
         """The points of a posterior; similar posteriors have similar points in the same order.
 
         Parameters
@@ -80,6 +85,9 @@ class SigmaPoints:
         shifts
             (Q, 6), changes of the logarithms that go with one standard deviation of Q other uncertain quantities.
             Their outer products are part of the posterior's covariance.  They are the last points.
+        width
+            Mean tyre width b [m].  Wheels of one width determine K_L, whatever its parts: where k_phi is a small part,
+            its logarithm is open, and K_L still known.  None: k_c and k_phi follow their logarithms alone.
         """
         along = np.zeros((0, len(posterior.soil))) if shifts is None else shifts
         variance, directions = np.linalg.eigh(posterior.log_covariance - along.T @ along)
@@ -89,7 +97,9 @@ class SigmaPoints:
         leading = min(len(free), LEADING_DIRECTIONS)
         points = design(leading)
         steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, along])
-        soils = np.asarray(posterior.soil) * np.exp(steps)
+        soils = np.asarray(posterior.soil) * np.exp(np.minimum(steps, MAX_STEP))
+        if width is not None:
+            soils[:, [_K_C, _K_PHI]] = moduli(posterior.soil, steps, width)
         soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
         return cls(soils, *_shares(leading, len(soils) - len(points)))
 
@@ -116,6 +126,14 @@ class SigmaPoints:
         if samples.ndim == 3:
             return np.asarray((self.share @ samples.swapaxes(0, 1)).swapaxes(0, 1))
         return np.asarray(self.share @ samples.reshape(len(samples), -1)).reshape(-1, *samples.shape[1:])
+
+
+def moduli(soil: Soil, steps: Array, width: float) -> Array:
+    """Return k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
+    part, whole = soil.k_c / width, soil.k_c / width + soil.k_phi
+    K_L = whole * np.exp((part * steps[:, _K_C] + soil.k_phi * steps[:, _K_PHI]) / whole)
+    of_k_c = np.minimum(part * np.exp(np.minimum(steps[:, _K_C], MAX_STEP)), (1.0 - LEAST_K_PHI) * K_L)
+    return np.stack([of_k_c * width, K_L - of_k_c], axis=1)
 
 
 def mean_and_std(samples: Array) -> tuple[Array, Array]:

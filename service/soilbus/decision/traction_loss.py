@@ -284,6 +284,24 @@ def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> N
     return np.where(of_shaft, apart, _without_torque(window, rig, before))
 
 
+def shared_out(limit: NDArray[np.float64], apart: NDArray[np.bool_], rig: Rig) -> NDArray[np.float64]:
+    """Return the torque limits (W,) [N m] where a motor's whole torque goes to the wheels that it still turns.
+
+    limit: as the motors share it out among all their wheels; apart: disengaged wheels (W,).
+    """
+    if rig.instrumentation is None or not apart.any():
+        return limit
+    limit = limit.copy()
+    for motor in rig.instrumentation.motors:
+        wheels, weight = np.array(motor.wheels), np.array(motor.weight)
+        on = ~apart[wheels]
+        whole, left = float(weight @ limit[wheels]), float((weight * limit[wheels])[on].sum())
+        if left > 0.0:
+            limit[wheels[on]] *= whole / left
+    limit[apart] = 0.0
+    return limit
+
+
 def _without_torque(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which wheels (W,) have no torque while another one pulls, most of the time; else as before."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -294,6 +312,12 @@ def _without_torque(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDAr
     if 2 * pulls.sum() <= len(traction):
         return before
     return np.where(2 * known.sum(axis=0) > len(known), 2 * still.sum(axis=0) > known.sum(axis=0), before)
+
+
+def disengaged(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which wheels (W,) a shaft of both axles does not turn after `since` [s], by speeds; else as before."""
+    of_shaft, apart = _disengaged(window.rows(np.flatnonzero(window.t > since)), rig, before)
+    return of_shaft & apart
 
 
 def _disengaged(window: Window, rig: Rig, before: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -24,7 +24,7 @@ from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soil_laws import lumped_modulus
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
+from soilbus.terra.vehicle import GRAVITY, Chassis, wheel_loads
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, WheelModel, WheelState
 
 NEWTON_TOLERANCE = 1e-3
@@ -102,21 +102,21 @@ class Axles:
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
         lengths = np.zeros(len(drives)) if rig.lengths is None else rig.lengths
-        columns = (rig.radius, rig.width, rig.front, lengths)
+        columns = (rig.radius, rig.width, rig.ahead, lengths)
         kinds = list(zip(*(column.tolist() for column in (*columns, drives)), strict=True))
         unlike = list(dict.fromkeys(kinds))
-        radius, width, front, long, drive = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
+        radius, width, ahead, long, drive = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
         count = np.array([[float(kinds.count(kind))] for kind in unlike])
-        share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
+        of_kind = [kinds.index(kind) for kind in unlike]
         cases = ((0.0, 0.0), (0.0, math.pi / 2.0), (1.0, 0.0))
         level, tilt, drawn = (
-            share * np.where(front, *axle_loads(rig.chassis, draft, slope, 0.0)) for draft, slope in cases
+            wheel_loads(rig.chassis, rig.ahead, draft, slope, 0.0)[of_kind, None] for draft, slope in cases
         )
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
         shared = () if rig.instrumentation is None else rig.instrumentation.motors
         length = 0.0 if rig.lengths is None else long
         lever = drawn - level
-        return cls(rig.chassis, radius, width, front, drive, count, level, tilt, lever, of_wheel, shared, length)
+        return cls(rig.chassis, radius, width, ahead == 1.0, drive, count, level, tilt, lever, of_wheel, shared, length)
 
     def wheel(self, load: Array) -> Wheel:
         """One wheel of each kind under a load [N] (..., A)."""

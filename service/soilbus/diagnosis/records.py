@@ -19,6 +19,7 @@ from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import Linearisation, ObservationModelWithEffects
+from soilbus.estimation.options import HELD, SolverOptions
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
@@ -96,6 +97,12 @@ class Record:
         return replace(self, training=training, held_out=held_out, whole=None, fold=None)
 
 
+def diagnosed(rig: Rig) -> Rig:
+    """Return the rig without standing parts: inertia and lateness are effects to be named; descents end nearer."""
+    search = replace(rig.options.search, cold=SolverOptions(100), warm=SolverOptions(100, step_tolerance=2e-4))
+    return replace(rig, options=replace(rig.options, search=search, standing=HELD))
+
+
 def record_of(
     name: str,
     window: Window,
@@ -125,7 +132,7 @@ def record_of(
     TooLittle
         Where the recording has not enough usable instants.
     """
-    problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn).on_curves()
+    problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed, max_turn).on_curves()
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
@@ -150,7 +157,7 @@ def record_of_rows(
     TooLittle
         Where the table has not enough usable rows.
     """
-    problem = ObservationModelWithEffects(window, rig, model, min_speed=0.0)
+    problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed=0.0)
     if problem.n < 5:
         raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
     rank = np.argsort(np.argsort(problem.slip.mean(1), kind="stable"))

@@ -35,7 +35,7 @@ from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.terra.effects.effect import Active, Effect, Parameter
-from soilbus.terra.vehicle import Chassis, axle_loads
+from soilbus.terra.vehicle import Chassis, wheel_loads
 from soilbus.terra.wheel import FAST_NODES, WheelModel
 from soilbus.words import did_you_mean
 
@@ -74,13 +74,14 @@ def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
     slip, computed = noise.pop("slip"), noise.pop("computed_load")
     noise["differential_lock"] = SensorNoise(absolute=1.0)
-    if of_table:  # its speeds are computed from the slip, see tables.py
+    if of_table:  # its speeds are computed from the slip, see tables.py; a few steady rows have the noise that they say
         noise |= {"speed": SensorNoise(), "ground_speed": slip}
+        options = replace(options, variance=replace(options.variance, least=1.0, most=1.0))
     rig = Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),
         width=np.array([w.width for w in wheels]),
-        front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
+        ahead=np.array([config.axles.get(str(w.axle), 1.0) for w in wheels]),
         chassis=chassis_of(config),
         noise=noise,
         lengths=np.array([w.contact_length for w in wheels]) if any(w.contact_length for w in wheels) else None,
@@ -98,6 +99,23 @@ def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
         driven=None if all(w.driven for w in wheels) else np.array([w.driven for w in wheels]),
     )
     return _with_instrumentation(rig, config, computed) if measured else rig
+
+
+def with_disengaged(config: Config, rig: Rig, apart: NDArray[np.bool_]) -> Rig:
+    """Return the rig while some of its wheels (W,) are disengaged: they roll freely, and the channels stay in place."""
+    if rig.instrumentation is None or not apart.any():
+        return rig
+    wheels = [w.model_copy(update={"driven": w.driven and not off}) for w, off in zip(config.wheel, apart, strict=True)]
+    free = rig_of(config.model_copy(update={"wheel": wheels}), rig.options)
+    assert free.instrumentation is not None
+    rows: dict[str, Any] = {
+        quantity: tuple(
+            row._replace(at=rig.names[quantity].index(row.name)) if row.kind == "channel" else row
+            for row in getattr(free.instrumentation, quantity)
+        )
+        for quantity in ("torque", "speed", "load")
+    }
+    return replace(free, names=rig.names, instrumentation=replace(free.instrumentation, **rows))
 
 
 def _torque_is_measured(config: Config) -> bool:
@@ -126,9 +144,9 @@ def _unmeasured(config: Config) -> Iterator[str]:
                 f"{w.section} {w.name} has no load: map {w.section}.{w.name}.load, or give the [vehicle]"
                 " whose weight it carries"
             )
-    if config.vehicle is not None and not config.on_tracks:
-        for axle in ("front", "rear"):
-            if axle not in {w.axle for w in config.wheel}:
+    if config.vehicle is not None and not config.on_one_axle:
+        for axle in ("front", "rear") if config.axles.keys() & {"front", "middle", "rear"} else ():
+            if axle not in config.axles:
                 yield f"no [[wheel]] is on the {axle} axle, which carries its share of the weight: give all wheels"
 
 
@@ -162,8 +180,7 @@ def motors_of(config: Config, rig: Rig) -> Motors:
         wheels = tuple(i for i, w in enumerate(config.wheel) if axle.name in ("both", w.axle) and w.driven)
         share = np.ones(len(wheels)) / max(len(wheels), 1)
         if axle.name == "both" and rig.chassis is not None:
-            front, rear = axle_loads(rig.chassis, 0.0, 0.0, 0.0)
-            grip = np.where(rig.front, front / max(rig.front.sum(), 1), rear / max((~rig.front).sum(), 1)) * rig.radius
+            grip = wheel_loads(rig.chassis, rig.ahead, 0.0, 0.0, 0.0) * rig.radius
             grip, gear = grip[list(wheels)], np.array([ratio.get(str(config.wheel[i].axle), 1.0) for i in wheels])
             share = grip / float((grip / gear).sum())
         motors.append(Motor(axle.name, wheels, tuple(share.tolist()), axle.max_torque or math.nan))
@@ -178,7 +195,7 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
     place = {name: i for i, name in enumerate(rig.wheels)}
     of_axle = {
         name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle))
-        for name in ("front", "rear", "both")
+        for name in (*config.axles, "both")
     }
     axle_ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
@@ -223,7 +240,7 @@ def _couplings(
     """The differentials: of each axle, and between the axles; wheels on one signal of speed turn together."""
     is_switched = config.vehicle is not None and config.vehicle.differential_lock is not None
     together = [set(group.wheels) for group in groups["speed"] if len(group.wheels) > 1 and group.name not in of_axle]
-    for name in ("front", "rear"):
+    for name in config.axles:
         wheels, axle = [i for i in of_axle[name] if drives[i]], config.axle_named(name)
         kind = "open" if axle is None else axle.differential
         bias = DIFFERENTIAL_BIAS[kind] if axle is None or axle.torque_bias is None else axle.torque_bias
@@ -231,8 +248,8 @@ def _couplings(
             rigid = any({one, other} <= wheels_together for wheels_together in together)
             yield Coupling((one,), (other,), bias, kind == "locked" or rigid, kind == "open", is_switched=is_switched)
     centre = config.axle_named("both")
-    front, rear = (tuple(i for i in of_axle[name] if drives[i]) for name in ("front", "rear"))
-    if front and rear:
+    driven = [on for name in config.axles if (on := tuple(i for i in of_axle[name] if drives[i]))]
+    for front, rear in pairwise(driven):
         kind = "locked" if centre is None else centre.differential
         bias = DIFFERENTIAL_BIAS[kind] if centre is None or centre.torque_bias is None else centre.torque_bias
         yield Coupling(front, rear, bias, kind == "locked", kind == "open", of_axle=False)
@@ -265,7 +282,8 @@ def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: S
 
 
 def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> list[Row]:
-    """Weight, its share on the front axle, and the differences left to right, a share of each axle's load; side: sd.
+    """Weight, its share on the front axle, what an axle between carries beside the line of the others, and the
+    differences left to right, a share of each axle's load; side: sd.
 
     A draft that nothing measures shifts load in all of a window: it counts with the centre of gravity.
     """
@@ -274,7 +292,7 @@ def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> li
     mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
     cg_std = UNKNOWN_SHARE * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
     share = chassis.cg_ahead_of_rear_axle / chassis.wheelbase
-    transfer = np.where(rig.front, 1.0 - share, -share)
+    transfer = rig.ahead - share
     shifted = 0.0 if knows_draft else unknown_draft(rig.options.measurements.largest_draft)[1] * chassis.hitch_height
     rows = [
         Row((1.0,) * n, "weight", 0, "weight", mass_std),
@@ -286,8 +304,14 @@ def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> li
             math.hypot(cg_std, shifted) / chassis.cg_ahead_of_rear_axle,
         ),
     ]
-    for axle in (rig.front, ~rig.front):
-        for one, other in pairwise(np.flatnonzero(axle).tolist()):
+    line = np.stack([np.ones(n), rig.ahead])
+    for axle in rig.axles[1:-1]:
+        alone = np.isin(np.arange(n), axle).astype(float)
+        alone -= line.T @ np.linalg.lstsq(line.T, alone, rcond=None)[0]
+        name = "-".join(rig.wheels[i] for i in axle)
+        rows.append(Row(tuple(alone.tolist()), "frame", axle[0], name, rig.options.measurements.axle_share))
+    for axle in rig.axles:
+        for one, other in pairwise(axle):
             name = f"{rig.wheels[one]}-{rig.wheels[other]}"
             rows.append(Row(contrast(n, [one], [other], np.ones(n)), "side", one, name, side))
     return rows
@@ -298,7 +322,7 @@ def chassis_of(config: Config) -> Chassis | None:
     if config.vehicle is None:
         return None
     given = config.vehicle.model_dump(include={f.name for f in fields(Chassis)})
-    return Chassis(**given, on_tracks=config.on_tracks)
+    return Chassis(**given, on_one_axle=config.on_one_axle)
 
 
 def prior_of(config: Config) -> SoilPrior:
@@ -389,12 +413,12 @@ def _has_tyres(config: Config) -> bool:
 
 
 def delays_of(config: Config) -> dict[str, float]:
-    """Delay [s] of each quantity by the effect channel_lag of model.effects; ConfigError as `effects_of`."""
+    """Delay [s] of each quantity by the effects of model.effects that make it late; ConfigError as `effects_of`."""
     if not config.model.effects:
         return {}
-    from soilbus.terra.effects.sensors import CHANNEL_LAG, lateness
+    from soilbus.terra.effects.sensors import lateness
 
-    return lateness([active for active in effects_of(config) if active.effect is CHANNEL_LAG])
+    return lateness(effects_of(config))
 
 
 def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
@@ -405,7 +429,8 @@ def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[t
     config : Config
         Validated configuration.
     undelayed : bool
-        Whether the intake has already corrected the delays of channels (`delays_of`), so that channel_lag is left out.
+        Whether the intake has already corrected the delays of channels (`delays_of`), so that effects which
+        make channels late are left out.
 
     Returns
     -------
@@ -422,11 +447,7 @@ def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[t
     """
     wheels = rig_of(config).wheels
     settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
-    active = [
-        a
-        for a in effects_of(config, wheels)
-        if not (a.effect.of_record or (undelayed and a.effect.name == "channel_lag"))
-    ]
+    active = [a for a in effects_of(config, wheels) if not (a.effect.of_record or (undelayed and a.effect.late))]
     free: list[Free] = []
     for effect, values in active:
         for parameter in effect.parameters:

@@ -27,7 +27,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
@@ -155,14 +154,14 @@ def _false_alarms(threshold: float, instants: int, residuals: int) -> float:
 
 
 class Transition(NamedTuple):
-    """Wheels come onto another soil: the front ones between `begin` and `end` [s], the rear ones `lag` [s] later."""
+    """Wheels come onto another soil: the first between `begin` and `end` [s], the last ones up to `lag` [s] later."""
 
     begin: float
     end: float
     lag: float
 
 
-def without_transition(window: Window, transition: Transition, front: NDArray[np.bool_]) -> Window:
+def without_transition(window: Window, transition: Transition, ahead: Array) -> Window:
     """The window without the wheels' measurements during a transition.
 
     Parameters
@@ -171,15 +170,15 @@ def without_transition(window: Window, transition: Transition, front: NDArray[np
         The whole window.
     transition : Transition
         Before its `begin` all data are of the first soil; a wheel's data count again when it has arrived.
-    front : Array
-        Which wheels (W,) are on the front axle.
+    ahead : Array
+        As `Rig.ahead` (W,).
 
     Returns
     -------
     Window
         With nan in torque, load, speed and sinkage of wheels between the soils.
     """
-    arrived = transition.end + np.where(front, 0.0, transition.lag)
+    arrived = transition.end + (1.0 - ahead) * transition.lag
     between = (window.t[:, None] >= transition.begin) & (window.t[:, None] < arrived)
 
     def blanked(values: Array) -> Array:

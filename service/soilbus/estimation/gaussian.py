@@ -114,35 +114,6 @@ class Gaussian:
             return Gaussian(self.soil * np.exp(step[:_SOIL]), gains, covariance)
         return Gaussian(self.soil, gains, covariance, self.offset + step[:_SOIL])
 
-    def conditioned_on(self, parameter: int, log: float) -> Gaussian:
-        """Conditional on the logarithm of a free parameter, which is held from then on."""
-        along = self.covariance[:, parameter] / self.covariance[parameter, parameter]
-        covariance = self.covariance - np.outer(along, self.covariance[parameter])
-        covariance[parameter] = covariance[:, parameter] = 0.0
-        return self.shifted(along * self._deviation(parameter, log), covariance)
-
-    def neg2_log_marginal(self, parameter: int, log: float, prior: SoilPrior) -> float:
-        """-2 log of the marginal at the logarithm of a free parameter; of a likelihood factor with the prior."""
-        value = self._deviation(parameter, log) ** 2 / float(self.covariance[parameter, parameter])
-        if self.offset is None or parameter not in LINEAR:
-            return value
-        return value + ((log - math.log(prior.median[parameter])) / float(prior.log_std[parameter])) ** 2
-
-    def _deviation(self, parameter: int, log: float) -> float:
-        """Of a parameter with this logarithm from its mean: of the logarithm, or linear in a likelihood factor."""
-        base = float(self.soil[parameter])
-        if self.offset is None:
-            return log - math.log(base)
-        change = math.expm1(log - math.log(base)) if parameter in LINEAR else log - math.log(base)
-        return change - float(self.offset[parameter])
-
-    def mixture(self, other: Gaussian, share: float) -> Gaussian:
-        """This mean, with the second moment about it of a mixture: this with 1 - share, the other with share."""
-        held = np.diag(self.covariance)[:_SOIL] == 0.0
-        off = np.concatenate([np.where(held, 0.0, np.log(other.soil / self.soil)), other.gains - self.gains])
-        of_other = other.covariance + np.outer(off, off)
-        return replace(self, covariance=(1.0 - share) * self.covariance + share * of_other)
-
     def drifted(self, soil: Array, gains: Array) -> Gaussian:
         """After a random walk of the soil's logarithms, covariance (6, 6), and of the gains, variance (G,)."""
         covariance = self.covariance.copy()
@@ -199,11 +170,6 @@ class Gaussian:
         removed, axes = np.linalg.eigh(np.eye(len(free)) - along[free] / np.outer(unit, unit))
         inverse = (axes / np.maximum(removed, 1e-3)) @ axes.T / np.outer(unit, unit)
         return free, self.covariance + along @ inverse @ along.T
-
-    def variance_of_k_c(self, prior: SoilPrior) -> float:
-        """Variance of log k_c, the prior included."""
-        own = float(self.covariance[_K_C, _K_C])
-        return own if self.offset is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
 
 
 class PriorQuadratic(NamedTuple):

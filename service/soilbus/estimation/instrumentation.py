@@ -11,6 +11,7 @@ no channel is left, what is known without measuring:
               omega = V / r (1 - s)      a wheel without sensor, until its torque says better
     load      sum W = m g cos(pitch)     and heave: what measured axles bounce
               front less rear            the shift to the front axle by pitch, acceleration and draft
+              axle between, less what the others' line gives it: 0, sd: how unequally axles share (`wheel_shares`)
               W_left - W_right           from the roll angle; sd: what uneven ground adds
 
 So a channel of two wheels is one noise and one gain error.  Where every wheel has its own torque, speed and load, all M
@@ -29,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.window import Rig, Window, steady, zero_if_unknown
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
+from soilbus.estimation.window import Rig, Window, pairs, steady, zero_if_unknown
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, wheel_loads
 
 __all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "unknown_draft", "with_speeds"]
 
@@ -261,6 +262,42 @@ def completed(window: Window, rig: Rig) -> Window:
     return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
 
 
+def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
+    """Return a window that was completed for a rig, completed for another one with the same channels."""
+    given, observations = rig.instrumentation, window.observations
+    if other is rig or given is None or observations is None:
+        return window
+    W, variance, raw = len(rig.wheels), dict(window.variance), dict[str, Any]()
+    columns = {
+        "torque": (observations.torque, observations.torque_var),
+        "load": (observations.value[:, :W], observations.variance[:, :W]),
+        "speed": (observations.value[:, W : 2 * W], observations.variance[:, W : 2 * W]),
+    }
+    for quantity, (values, variances) in columns.items():
+        raw[quantity], variance[quantity] = (np.full(values.shape, np.nan) for _ in range(2))
+        for i, row in enumerate(getattr(given, quantity)):
+            if row.kind == "channel":
+                raw[quantity][:, row.at], variance[quantity][:, row.at] = values[:, i], variances[:, i]
+    return completed(replace(window, variance=variance, observations=None, **raw), other)
+
+
+def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
+    """Return a completed window with the wheel speeds that give each wheel its own slip at the vehicle's ground speed.
+
+    On a curve at yaw rate q (N,) [rad/s] a wheel half a track to the left moves over the ground at V - q B / 2.
+    """
+    yaw = zero_if_unknown(yaw_rate)
+    if rig.track is None or rig.chassis is None or not yaw.any():
+        return window
+    left, right = pairs(rig)
+    own = np.repeat(window.ground_speed[:, None], len(rig.wheels), axis=1)
+    own[:, left] -= yaw[:, None] * rig.track / 2.0
+    own[:, right] += yaw[:, None] * rig.track / 2.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where(own > 0.0, window.ground_speed[:, None] / own, 1.0)
+    return with_speeds(window, rig, window.speed * np.where(np.isfinite(scale), scale, 1.0))
+
+
 def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
     """A completed window with other speeds (N, W) of the wheels."""
     given, observations = rig.instrumentation, window.observations
@@ -321,6 +358,7 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
         pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
         direction = window.direction if len(window.direction) else np.ones(n)
         static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
+        upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
         if row.kind == "weight":
             scale[:, i], variance[:, i] = weight * np.cos(pitch), (given.load_noise / 2.0 * weight) ** 2
             load[:, i] = scale[:, i] + _heave(window, rig, given)
@@ -340,8 +378,11 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
                 + (chassis.mass * chassis.cg_height / chassis.wheelbase) ** 2 * of_pitch
                 + np.where(by_draft[:, i] == 0.0, (chassis.hitch_height / chassis.wheelbase) ** 2 * draft_var, 0.0)
             )
+        elif row.kind == "frame":
+            scale[:, i] = upright[rig.ahead == rig.ahead[row.at]].sum()
+            variance[:, i] = (given.load_noise * np.linalg.norm(np.array(row.weight) * upright)) ** 2
         else:  # left less right
-            axle = static if rig.front[row.at] else weight - static
+            axle = float(upright[rig.ahead == rig.ahead[row.at]].sum())
             lever = 0.0 if rig.track is None else chassis.cg_height / rig.track
             load[:, i] = -2.0 * axle * lever * np.sin(roll)
             scale[:, i] = axle
@@ -365,8 +406,7 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
         return np.zeros(len(window.t))
     direction = window.direction if len(window.direction) else np.ones(len(window.t))
     along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
-    axles = axle_loads(rig.chassis, direction * window.draft, *along)
-    of_wheels = np.stack([axles[0 if front else 1] / np.sum(rig.front == front) for front in rig.front])
+    of_wheels = wheel_loads(rig.chassis, rig.ahead, direction * window.draft, *along)
     beyond = np.sum([window.load[:, row.at] - np.array(row.weight) @ of_wheels for row in channels], axis=0)
     known = np.isfinite(beyond)
     return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))

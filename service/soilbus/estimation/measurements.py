@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import completed
+from soilbus.estimation.instrumentation import completed, straightened
 from soilbus.estimation.local_cubics import Series, curve_of
+from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -51,7 +52,7 @@ _BY_INSTANT = (
     "inertia", "inertia_var", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
     "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
-    "_side_known",
+    "_side_known", "standing_rows", "standing_latents",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
 _BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
@@ -59,7 +60,7 @@ _BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
 
 
 def gain_names(rig: Rig) -> list[str]:
-    """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft."""
+    """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft; then of STANDING."""
     return gains_of(rig)[0]
 
 
@@ -77,7 +78,7 @@ def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
             rows = getattr(given, quantity)
             names += [f"{quantity}.{row.name or f'{row.kind}{row.at}'}" for row in rows]
             std += [row.gain for row in rows]
-    return names, std
+    return [*names, *STANDING], [*std, *standing_std(rig)]
 
 
 class Measurements:
@@ -104,7 +105,8 @@ class Measurements:
         window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
-        straight = moving & ~in_turn
+        yaw_rate = self._curves.of("yaw_rate")[0].smooth.at(window.t)[0]
+        straight, window = moving & ~in_turn, straightened(window, rig, yaw_rate)
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
@@ -144,6 +146,8 @@ class Measurements:
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
+        if rig.lengths is not None:
+            load, load_var = steady_loads(load, load_var, usable & (rig.lengths > 0.0))
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
@@ -176,10 +180,22 @@ class Measurements:
         known = np.concatenate(known_rows[:n_kinds], axis=1)
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
+        self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None
         self.common_weights: Array | None = None
         self._off_curve: Array | None = None
         self._count()
+
+    def _stand(self, columns: StandingColumns, kept: NDArray[np.intp]) -> None:
+        """Set the derivatives by STANDING of the rows (N, m, S) and of the observed latents (N, 2 W + 1, S)."""
+        torque, latents = columns.torque[kept], columns.latents[kept]
+        if self._torque_matrix is not None and self._latent_matrix is not None:
+            torque, latents = self._torque_matrix @ torque, self._latent_matrix @ latents
+        self.standing_rows = np.zeros((*self._row_var.shape, len(STANDING)))
+        self.standing_rows[:, : self.n_wheels] = torque
+        self.standing_rows[:, self.n_wheels] = columns.demand[kept]
+        self.standing_rows[~self._known] = 0.0
+        self.standing_latents = latents
 
     def on_curves(self) -> Self:
         """The same with latents on smooth curves of what is measured, where two wheels share a torque.
@@ -317,6 +333,33 @@ class Measurements:
         return np.concatenate(parts, axis=1)
 
     @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which residuals (N, m) have a measurement."""
+        return self._known
+
+    @property
+    def wheel_torque(self) -> Array:
+        """Torques (N, W) [N m] of the wheels by the rows of torques; differentials share equally."""
+        if self._torque_matrix is None:
+            return self.torque
+        return np.asarray(np.linalg.solve(self._torque_matrix, self.torque.T).T)
+
+    @property
+    def measured_rows(self) -> NDArray[np.bool_]:
+        """Which residuals (m,) of an instant are of a sensor, and not of how a differential shares torque."""
+        given, rest = self.rig.instrumentation, self._n_residuals - self.n_wheels
+        torques = [True] * self.n_wheels if given is None else [row.kind == "channel" for row in given.torque]
+        return np.array([*torques, *[True] * rest])
+
+    @property
+    def measured_latents(self) -> NDArray[np.bool_]:
+        """Which latents (2 W + 1,) a sensor measures, and no geometry or coupling computes."""
+        given, W = self.rig.instrumentation, self.n_wheels
+        if given is None:
+            return np.ones(2 * W + 1, bool)
+        return np.array([*(row.kind == "channel" for row in (*given.load, *given.speed)), True])
+
+    @property
     def _n_residuals(self) -> int:
         """Number m of residuals of an instant."""
         return int(self._row_var.shape[1])
@@ -359,7 +402,8 @@ class Curves:
             names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self._wheels]
             if all(name in self.window.curves for name in names):
                 return self._cache.setdefault(quantity, [self.window.curves[name] for name in names])
-            columns = values.reshape(len(self.window.t), -1), variances.reshape(len(self.window.t), -1)
+            shape = len(self.window.t), self.number_of(quantity)
+            columns = values.reshape(shape), variances.reshape(shape)
             self._cache[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
         return self._cache[quantity]
 
@@ -371,6 +415,21 @@ class Curves:
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])
+
+
+def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return loads (N, W) and variances, with the mean in place of a track's loads that vary no more than their noise.
+
+    A track presses evenly, so that nothing but its load tells c and tan phi apart.  Gauss-Newton takes noise in a
+    regressor for information (Neyman & Scott 1948, Econometrica 16:1), and would tell them apart by it.
+    """
+    load, variance = load.copy(), variance.copy()
+    for w in range(load.shape[1]):
+        on = tracks[:, w] & (variance[:, w] > 0.0)
+        n = int(on.sum())
+        if n > 1 and load[on, w].var() < 2.0 * variance[on, w].mean():  # half of it is noise
+            load[on, w], variance[on, w] = load[on, w].mean(), variance[on, w].mean() / n
+    return load, variance
 
 
 def off_curve(t: Array, value: Array, variance: Array) -> Array:

@@ -8,15 +8,13 @@ prior) and the Gaussian there,
 
 `fit_window` finds it where nothing is known: the soil alone descends on a few instants, with loads and speeds as
 measured, from the prior's median, loam and the likeliest soils of the table until two descents meet; from the best end
-soil, gains and latents descend together on all instants.  Where the data allow a second mode, it is looked for too,
-and the two share the probability by their evidence.  `fit_warm` starts at the optimum of the window before.
+soil, gains and latents descend together on all instants.  `fit_warm` starts at the optimum of the window before.
 All return a `Fit`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,7 +23,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.model_form import FormPosterior
-from soilbus.estimation.observation_model import CurvedPathFit, ObservationModel, Optimum
+from soilbus.estimation.observation_model import ObservationModel, Optimum
 from soilbus.estimation.posterior import NORMAL_95, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, WindowModel, minimise
@@ -34,22 +32,14 @@ from soilbus.terra.wheel import Soil
 
 __all__ = [
     "Fit",
-    "SecondMode",
     "fit_at",
     "fit_window",
 ]
 
 
-class SecondMode(NamedTuple):
-    """Another optimum, by mode and curvature, and its share of the probability of both (Laplace)."""
-
-    gaussian: Gaussian
-    share: float
-
-
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Outcome of one fit.  All of it is of a constant soil until `drift_filter` moves it to the window's end.
+    """Outcome of one fit, of a constant soil.
 
     Attributes
     ----------
@@ -69,18 +59,8 @@ class Fit:
         Evaluations of the model.
     termination
         Why the descent ended.
-    second_mode
-        Another optimum that is about as likely, where one was found.
-    marginalised
-        Mean and covariance of the posterior averaged along n (`laplace`), where that was done.
-    curved_path
-        What was removed from the data for a curved path (`path_curvature`); objective and evidence include it.
-    off_scale
-        Whether sinkages and the other measurements agree on no soil (see `tracker.sinkages_off_scale`).
     form
         What the model's form leaves open (`model_form`).
-    is_gaussian
-        Whether one mode describes the posterior; only then can it be the prior of later windows.
     """
 
     mode: Gaussian
@@ -91,26 +71,12 @@ class Fit:
     rows: int
     iterations: int
     termination: Termination
-    second_mode: SecondMode | None = None
-    marginalised: Gaussian | None = None
-    curved_path: CurvedPathFit | None = None
-    off_scale: bool = False
     form: FormPosterior | None = None
-    is_gaussian: bool = True
 
     @property
     def posterior(self) -> Posterior:
-        """The marginal of the soil in what is reported."""
-        return self.reported.posterior
-
-    @property
-    def reported(self) -> Gaussian:
-        """Soil and gains to be reported: `marginalised`, else the mixture of both modes, else `mode`."""
-        if self.marginalised is not None:
-            return self.marginalised
-        if self.second_mode is None:
-            return self.mode
-        return self.mode.mixture(self.second_mode.gaussian, self.second_mode.share)
+        """The marginal of the soil."""
+        return self.mode.posterior
 
     @property
     def converged(self) -> bool:
@@ -150,12 +116,7 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
     thin = Objective(problem.thinned(options.thinned), prior, joint_prior, as_measured=True)
     with np.errstate(all="ignore"):
         ends = _search(thin)
-        best = _joint_fit(objective, ends[0]) if ends else None
-        if best is None or best.chi2 > options.plausible_chi2:
-            return best
-        if not best.converged:
-            return refit_denoised(objective, best)
-        return _with_second_mode(objective, thin, best, ends)
+        return _joint_fit(objective, ends[0]) if ends else None
 
 
 class WarmStart(NamedTuple):
@@ -195,46 +156,6 @@ def fit_warm(start: WarmStart) -> Fit | None:
 def refine(objective: Objective, start: Iterate) -> Fit | None:
     """Fit from near the optimum; None where the numbers are not finite."""
     return fit_at(objective, minimise(objective, start, objective.options.warm, 0.0))
-
-
-def refit_denoised(objective: Objective, fit: Fit) -> Fit:
-    """A fit that has not converged, with the optimum of the denoised observation model near it.
-
-    Where loads and slips hardly vary, the fitted latents vary by noise alone.  Gauss-Newton takes that noise for
-    information: the predicted steps are short, and the descent creeps along a valley without a meaningful end.
-    Without the noise (`ObservationModel.denoised`) the window is a regression with known regressors, and prior
-    and data make it convex.
-
-    Returns
-    -------
-    Fit
-        The fit itself where its chi2 exceeds `plausible_chi2` or no such optimum is found.
-    """
-    if not fit.chi2 < objective.options.plausible_chi2:
-        return fit
-    optimum = fit.optimum
-    with np.errstate(all="ignore"):
-        denoised, latents = objective.problem.denoised(optimum)
-        again = Objective(denoised, objective.coordinates.prior, objective.joint_prior)
-        found = refine(again, Iterate(optimum.soil, optimum.gains, latents))
-        if found is None or not found.converged:
-            return fit
-        near = objective.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
-        first = objective.quadratic_model(near)
-        iterate = near if first is None else objective.stepped(near, first, np.zeros(len(first.gradient)))
-        model = objective.quadratic_model(iterate)
-    if first is None or model is None:
-        return fit
-    return replace(
-        fit,
-        mode=found.mode,
-        sinkage=found.sinkage,
-        optimum=Optimum(objective.problem.t, iterate.soil, iterate.gains, iterate.latents, model.linearisation),
-        neg2_log_posterior=model.neg2_log_posterior,
-        neg2_log_evidence=model.neg2_log_evidence,
-        iterations=fit.iterations + found.iterations,
-        termination=found.termination,
-    )
 
 
 def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
@@ -296,44 +217,6 @@ def _joint_fit(objective: Objective, end: _End) -> Fit | None:
     if not end.value < options.implausible * options.thinned:
         descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
     return fit_at(objective, minimise(objective, start, descent), end.evaluations)
-
-
-def _with_second_mode(objective: Objective, thin: Objective, found: Fit, ends: Sequence[_End]) -> Fit:
-    """The likelier of an optimum and another one, with the other as its second mode.
-
-    The candidate is an end of the search other than the first, from which `found` was reached.  There is no second mode
-    where its share of the probability is below `min_mode_share` or the one lies in the 95 % interval of the other.
-    """
-    options = objective.options
-    has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
-    end = _other_end(thin, found, ends) if has_two_widths else None
-    if end is None:
-        return found
-    other = _joint_fit(objective, end)
-    if other is None or not other.converged:
-        return found
-    better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
-    share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.neg2_log_evidence - better.neg2_log_evidence), 50.0)))
-    is_distinct = better.mode.posterior.distance(worse.mode.posterior.soil) >= NORMAL_95
-    if share < options.min_mode_share or not is_distinct:
-        return better
-    return replace(better, second_mode=SecondMode(worse.mode, share), is_gaussian=False)
-
-
-def _other_end(thin: Objective, found: Fit, ends: Sequence[_End]) -> _End | None:
-    """The best end of a descent on a few instants that is far from `found`, and farther than the nearest end."""
-    here = thin.quadratic_model(thin.start(found.mode.soil)) if len(ends) > 1 else None
-    if here is None:
-        return None
-    position = thin.coordinates.position(found.mode.soil)
-
-    def squared_distance(end: _End) -> float:
-        off = np.zeros(len(here.gradient))
-        off[: len(position)] = thin.coordinates.position(end.soil) - position
-        return here.squared_length(off)
-
-    away = max(thin.options.other_optimum_sd**2, min(map(squared_distance, ends)))
-    return next((end for end in ends[1:] if squared_distance(end) > away), None)
 
 
 def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluations: int = 0) -> Fit | None:

@@ -24,8 +24,7 @@ of a free wheel, and that row is used up.
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
-may also be delays of channels.  `denoised` takes the derivatives at latents of which the noise is shrunk; the nested
-Laplace approximation uses it.
+may also be delays of channels.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ class Layout(NamedTuple):
 
     rows of an instant (m): torques, balance, sinkages; latents (2 W + 1): loads, speeds, ground_speed.
     columns: RESIDUAL | SOIL | sensor_columns | effect_columns; within `gains` (G,): sensors (torque_gains,
-    latent_gains in the order of the latents, draft_gain), then effects.
+    latent_gains in the order of the latents, draft_gain, standing as in `standing.STANDING`), then effects.
     """
 
     torques: slice
@@ -95,6 +94,7 @@ class Layout(NamedTuple):
     torque_gains: slice
     latent_gains: slice
     draft_gain: int
+    standing: slice
     effects: slice
     sensor_columns: slice
     effect_columns: slice
@@ -106,8 +106,8 @@ class Layout(NamedTuple):
         return cls(
             torques=wheels, balance=W, sinkages=slice(W + 1, None),
             n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
-            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, n_sensors - 1),
-            draft_gain=n_sensors - 1, effects=slice(n_sensors, None),
+            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
+            draft_gain=3 * W + 1, standing=slice(3 * W + 2, n_sensors), effects=slice(n_sensors, None),
             sensor_columns=slice(FIRST_GAIN, column),
             effect_columns=slice(column, None),
         )  # fmt: skip
@@ -186,13 +186,6 @@ class Optimum:
     at: Linearisation
 
 
-class CurvedPathFit(NamedTuple):
-    """Optimum of a window before path curvature was removed from its data, and the basis (N, K) of that curvature."""
-
-    optimum: Optimum
-    basis: Array
-
-
 class Response(NamedTuple):
     """Drawbar pull [N], torque [N m] and sinkage [m], value (3, N, W), of wheels that carry the latent loads.
 
@@ -254,18 +247,6 @@ class DelayTerms(NamedTuple):
     by_predicted: Array
 
 
-class HeldLatents(NamedTuple):
-    """What a denoised observation model holds (`ObservationModel.denoised`).
-
-    observed (N, 2 W + 1): what would be measured of the shrunk latents.  by_latents (N, m, 2 W + 1),
-    inverse (N, m, m): derivatives of the residuals by the latents, and inverse covariance.
-    """
-
-    observed: Array
-    by_latents: Array
-    inverse: Array
-
-
 class ObservationModel(Measurements):
     """One window's measurements and the wheel-soil model; `linearise` gives residuals and derivatives at any soil.
 
@@ -295,7 +276,6 @@ class ObservationModel(Measurements):
         self.work = Work()
         self.layout = Layout.of(self.n_wheels, self.n_sensors)
         self.gain_bounds = np.full((2, len(self.gain_std)), [[-np.inf], [np.inf]])
-        self.held: HeldLatents | None = None
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals, their derivatives and their inverse covariance at one point.
@@ -314,8 +294,7 @@ class ObservationModel(Measurements):
         Returns
         -------
         Linearisation
-            With the latents eliminated: a step of soil and gains moves them as `updated` says.  Where latents are
-            held, derivatives are taken there with the weights of the optimum, and they stay.
+            With the latents eliminated: a step of soil and gains moves them as `updated` says.
         """
         layout = self.layout if by_sensors else Layout.of(self.n_wheels, 0)
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
@@ -343,12 +322,16 @@ class ObservationModel(Measurements):
             residual[:, sinkages] = self.sinkage - at.value[2]
             by_soil[:, sinkages] = -at.by_soil[2].transpose(1, 2, 0)
             by_effects[:, sinkages] = -at.by_effects[2].transpose(1, 2, 0)
+        standing = gains[self.layout.standing]
+        corrected += self.standing_latents @ standing
+        residual += self.standing_rows @ standing
         now = self.observed(latents.joined())
         latent_by_gain = now * of_latents
         if by_sensors:
             by_gain = rows[:, :, layout.sensor_columns]
             np.einsum("nww->nw", by_gain[:, torques, layout.torque_gains])[:] = -of_torque * torque
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, layout.latent_gains])
+            by_gain[:, :, layout.standing] = self.standing_rows + A @ self.standing_latents
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
             residual += self.delay_residuals(delay, A, gains)
@@ -367,17 +350,7 @@ class ObservationModel(Measurements):
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
-        if self.held is None:
-            inverse = self.inverse_covariance(A, variance, row_var)
-        else:  # r + (A_held - A)(corrected - observed): linear in the latents about those that are held
-            change, A, inverse = self.held.by_latents - A, self.held.by_latents, self.held.inverse
-            residual += (change @ (corrected - self.held.observed)[:, :, None])[:, :, 0]
-            if by_sensors:
-                by_gain[:, :, layout.latent_gains] -= change * latent_by_gain[:, None, :]
-            if len(by_delay):
-                by_effects += np.einsum("nml,pnl->nmp", change, by_delay)
-            corrected, by_delay = self.held.observed, by_delay[:0]
-            variance, latent_by_gain = np.zeros_like(variance), np.zeros_like(latent_by_gain)
+        inverse = self.inverse_covariance(A, variance, row_var)
         if by_sensors:
             # draft and inertia without their noise, which S^-1 r says: a gain times noise would fit better when smaller
             noise = (inverse[:, balance] * residual).sum(1)
@@ -406,26 +379,6 @@ class ObservationModel(Measurements):
             side_load=side_load,
             by_sides=by_sides,
         )
-
-    def denoised(self, optimum: Optimum) -> tuple[Self, Latents]:
-        """The model near one of its optima with loads and speeds held at shrunk values, and these.
-
-        Loads and speeds fitted instant by instant keep part of their noise.  Derivatives taken
-        there see variation that is not in the data: n is separated from k_phi by loads that
-        differ, and noisy loads differ.  This false information grows with the number of
-        instants (Neyman & Scott 1948, Econometrica 16:1).  Derivatives are therefore taken at
-        `shrunk_latents`, which leaves the score unbiased and makes the information its
-        variance (conditional score: Stefanski & Carroll 1987, Biometrika 74:703).  Weights and
-        derivatives by the latents are those of the optimum; only the entry angles are solved again.
-        """
-        soil, gains, fitted = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents
-        observed = shrunk_latents(self.observed(fitted.joined()), self.noise_of_fitted(optimum))
-        latents = self.with_entry_angles(self._latents(self.from_observed(observed), fitted.entry_angle), soil, gains)
-        by_latents = self.linearise(soil, gains, latents).by_latents
-        inverse = self.inverse_covariance(by_latents, *self.variances(gains))
-        calm = copy(self)
-        calm.held = HeldLatents(observed, by_latents, inverse)
-        return calm, latents
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
         """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring.
@@ -493,17 +446,6 @@ class ObservationModel(Measurements):
         residual = at.rows[:, RESIDUAL].reshape(inverse.shape[:2])
         missed = np.einsum("ni,nij,nj->", residual, R, residual) - np.sum(R * (np.linalg.inv(inverse) - K))
         return float(at.chi2 - missed - np.count_nonzero(~self._known))
-
-    def noise_of_fitted(self, optimum: Optimum) -> Array:
-        """Variance (N, 2 W + 1) of the noise in latents: V as measured; V - V A' S^-1 A V where torques say more."""
-        A, noise, fitted = optimum.at.by_latents, optimum.at.variance, self._by_torques
-        if not fitted.any():
-            return noise
-        by, prior = A[:, :, fitted], noise[:, fitted]
-        inverse = self.inverse_covariance(A, *self.variances(optimum.gains))
-        noise = noise.copy()
-        noise[:, fitted] = prior - prior**2 * (by * (inverse @ by)).sum(1)
-        return noise
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
         """Observations (N, S) of loads left less right after a Newton step to equal torques.
@@ -622,7 +564,7 @@ class ObservationModel(Measurements):
         fit better.
         """
         layout = self.layout
-        gain_factors = 1.0 / (1.0 + gains[layout.sensors])
+        gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
         of_torque, of_latents = gain_factors[layout.torque_gains], gain_factors[layout.latent_gains]
         of_draft = float(gain_factors[layout.draft_gain])
         row_var = self._row_var.copy()
@@ -650,7 +592,7 @@ class ObservationModel(Measurements):
         """
         residual, layout = np.zeros(A.shape[:2]), self.layout
         if delay is not None:
-            gain_factors = 1.0 / (1.0 + gains[layout.sensors])
+            gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
             residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains] - delay.predicted
             residual[:, layout.balance] = delay.demand
             residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
@@ -677,6 +619,7 @@ class ObservationModel(Measurements):
         if noise is None:
             noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
         new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
+        new += self.standing_latents @ gain_step[layout.standing]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
         new[:, self._side_columns] = at.side_load
@@ -1218,32 +1161,6 @@ def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Arr
     limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
     step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
     return np.asarray(np.clip(slip + np.clip(step, -limit, limit), -most, 0.0))
-
-
-def shrunk_latents(fitted: Array, variance: Array) -> Array:
-    """Latents (N, L) with their noise shrunk, from fitted ones (N, L) and the variance (N, L) of these.
-
-    Best linear prediction from the window itself: a direction that varies no more than
-    noise does becomes the window's mean, and so does such a latent, whose noise happens to
-    go with other latents by 1 / sqrt(N).  Latents without variance stay.
-
-    References
-    ----------
-    Singular values are shrunk as by Gavish & Donoho 2017, IEEE Trans. Inf. Theory 63:2137, eq. 7.
-    """
-    n = len(fitted)
-    scale = np.sqrt(variance.mean(0))
-    noisy = np.flatnonzero(scale > 0.0)
-    mean = fitted.mean(0)
-    left, size, right = np.linalg.svd((fitted - mean)[:, noisy] / scale[noisy], full_matrices=False)
-    square, ratio = size**2 / n, len(noisy) / n
-    kept = np.sqrt(np.maximum((square - ratio - 1.0) ** 2 - 4.0 * ratio, 0.0)) / np.maximum(square, 1e-300)
-    kept[square <= (1.0 + np.sqrt(ratio)) ** 2] = 0.0
-    shrunk = fitted.copy()
-    shrunk[:, noisy] = mean[noisy] + (left * (size * kept)) @ right * scale[noisy]
-    still = noisy[fitted[:, noisy].var(0) <= (scale[noisy] * (1.0 + 1.0 / math.sqrt(n))) ** 2]
-    shrunk[:, still] = mean[still]
-    return shrunk
 
 
 SINGULAR_RIDGE = 1e-10

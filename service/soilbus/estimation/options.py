@@ -13,12 +13,15 @@ from dataclasses import dataclass
 
 __all__ = [
     "ESTIMATOR",
+    "HELD",
     "EstimatorOptions",
     "MeasurementOptions",
     "PosteriorOptions",
     "SearchOptions",
     "SolverOptions",
+    "StandingOptions",
     "TrackerOptions",
+    "VarianceOptions",
 ]
 
 
@@ -43,6 +46,9 @@ class MeasurementOptions:
     side_slope_share: float = 0.06
     """Sd of an axle's mean loads left less right over their sum [1] on side slopes, where no roll is measured: 3
     degrees."""
+    axle_share: float = 0.1
+    """Sd of an axle's mean load beside the line through the others' over it [1], on three axles or more: a
+    tyre deflects by 30 to 50 mm under its load, so that 4 mm of wear, or a tenth less pressure, take a tenth of it."""
     largest_draft: float = 0.5
     """Largest draft that nothing measures, over the weight [1]: where net traction ratios of tractors in fields end
     (Wismer & Luth 1974).  It shifts load to the rear in all of a window; counted as independent from bin to bin it left
@@ -81,7 +87,7 @@ class SolverOptions:
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Starts of a window's fit, steps of the soil, bounds, and a second mode."""
+    """Starts of a window's fit, steps of the soil, bounds."""
 
     same_end: float = 0.02
     """Relative difference of the objectives [1] below which two descents of the search have met."""
@@ -96,12 +102,6 @@ class SearchOptions:
     max_implausible_evaluations: int = 5
     """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
     `replay-bogging` gets an estimate."""
-    other_optimum_sd: float = 10.0
-    """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum: with 2 more second modes
-    are fitted, and borders in `replay-stubble` are searched in other windows (202 values move, few by 0.1 sd)."""
-    min_mode_share: float = 0.05
-    """Share of the probability [1] below which a second mode does not count.  With 0.02 and 0.15 no golden value moves.
-    """
     typical_depth: float = 0.03
     """Sinkage [m] at which the bearing pressure is a coordinate.  With 0.015 and 0.06 no status of the golden replays
     moves."""
@@ -117,49 +117,24 @@ class SearchOptions:
     curved where the soil alone is not."""
     soil_alone: SolverOptions = SolverOptions(10, step_tolerance=0.1, max_rise=0.0)
     """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
-    cold: SolverOptions = SolverOptions()
+    cold: SolverOptions = SolverOptions(step_tolerance=1e-2)
     """Joint descent of soil, gains and latents from there."""
-    warm: SolverOptions = SolverOptions(step_tolerance=2e-4)
-    """Joint descent from near the optimum: of 382 windows of the golden recordings 9 in 10 end within 0.02 posterior
-    sd of it, after 2 evaluations in the mean."""
-    along_n: SolverOptions = SolverOptions(step_tolerance=1e-2)
-    """Descent of a node of the average along n: with 2e-4 a node takes 2.7 evaluations in place of 2.1.  In 28 windows
-    of two machines without load cells means of log n then differ by 0.11 sd at most (0.02 rms), and its sd by 4 %."""
+    warm: SolverOptions = SolverOptions(step_tolerance=1e-2)
+    """Joint descent from near the optimum, to 0.1 posterior sd: nearer, valleys of a drive that shakes end at no
+    optimum (85 of 170 windows of `b-2wd-loam` with 2e-4, 4 with 1e-2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PosteriorOptions:
-    """What a fit's posterior is: moments, average along n, drift, path curvature, form, soil classes."""
+    """What a fit's posterior is: moments, form, soil classes."""
 
-    determined_n_sd: float = 0.05
-    """Sd of log n [1] below which a posterior with one mode counts as Gaussian.  With 0.025 ten states of the golden
-    replays move, with 0.1 none."""
-    min_load_signal: float = 4.0
-    """Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1
-    all of it is noise, at 4 a quarter is."""
-    first_node_step: float = 0.1
-    """Longest first step of log n [1] from the mode.  With 0.05 and 0.2 no status of the golden replays moves, and 30
-    values at most."""
-    node_step_growth: float = 1.7
-    """Ratio [1] of each step of log n to the one before: 10 nodes in place of 12 with 1.4, the same errors and coverage
-    at constant loads (`posterior_forms --seed 178`); longer first steps are not as good there."""
-    negligible: float = 9.0
-    """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
-    gaussian_widening: float = 1.2
-    """How much wider [1] than the mode's Gaussian the average along n may be for a posterior to count as one: without
-    this limit the windows of a rear-driven tractor, all averaged, make intervals that hold in 54 to 100 % on three
-    minutes of loam and clay, with it in 66 to 100 %."""
     max_log_variance: float = 4.0
     """Variance of a parameter's logarithm [1] from which it is open, in what is reported: one that may be anywhere
     within `bound_sd` prior sd (of 0.83, std = value) is uniform, with 4^2 0.83^2 / 3 = 3.7.  At its bound a parameter
     that is linear in the fit may have any variance of its logarithm: without this k_phi had an std of 1e155 on snow."""
-    drift_pieces: int = 5
-    """Pieces of a window, each with its own soil.  With 3 and 8 three and six states of the golden replays move."""
-    steady_drift_sd: float = 7.0
-    """Prior sd of a steady change of the soil in one window, in units of `drift` [1].  With 3 and 20 no status of the
-    golden replays moves."""
-    knot_spacing: float = 1.0
-    """Time [s] between two knots of the path's curvature.  With 0.5 and 2 s no status of the golden replays moves."""
+    form_discount: float = 3.0
+    """Residuals [1] that say as much of the contact's form as one would say without errors of the model that all share.
+    With 1 tan phi of `d-base-0` is 12 % off with an sd of 4 %, with 6 pressures on the foreign drives are 18 % off."""
     form_stride: int = 4
     """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
     mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
@@ -172,15 +147,16 @@ class TrackerOptions:
 
     false_alarms_per_hour: float = 1.0
     """Windows an hour [1/h] in which noise alone makes the change detector search for another soil."""
-    mismatch_sd: float = 3.5
-    """Sd of reduced chi-square [sd] by which a window may exceed `Settings.max_chi2`; 0 after a mismatch.  With 2 and 6
-    no golden value moves."""
-    settled_sd: float = 1.5
-    """The same [sd] just after a border: its remains in the window bias the soil long before they are a mismatch."""
+    steady_drift: float = 4.0
+    """Prior sd of a steady change of the soil in one window, in units of `Settings.drift` [1]: a field that changes as
+    one goes, beside a random walk.  On soils that drift by 10 % a window 95 % of the intervals hold, with 0 only 88."""
+    several_soils: float = 3.0
+    """Chi-square per residual [1], in units of what the windows before left, above which another soil is looked for."""
+    first_rounds: int = 4
+    """Fits of a first window, each with the variance components that the one before left: the factors of `d-base-0`
+    then change by less than a tenth."""
     significance: float = 25.0
-    """Fall of -2 log evidence by two soils instead of one [1] from which the change is accepted; of -2 log posterior by
-    a longer transition, beyond the number of residuals left out, and by path curvature at knots; score statistic above
-    which sinkages are on a wrong scale: 5 sd of one unknown.  Curvature fits noise by about 9 in a window of 10 s."""
+    """Fall of -2 log evidence by two soils instead of one [1] from which a change is accepted: 5 sd of one unknown."""
     min_rows_per_soil: int = 30
     """Residuals that each of two soils needs before they are compared.  With 10 a border in `replay-bogging` is taken
     for a soil too early, with 90 two are found late."""
@@ -193,14 +169,53 @@ class TrackerOptions:
     """Windows [1] that the data must fill for the posterior to be a later prior: with less it is not Gaussian."""
     max_unexplained: float = 2.0
     """Windows [1] after a change point during which a change may explain a mismatch."""
-    extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
-    """Shares [1] of a new soil's data that are tried as part of its transition."""
     transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
     """Lengths of a transition that are tried [wheelbases; of a rig wheel diameters]: borders are sharp or gradual."""
     gain_memory: float = 60.0
     """Windows [1] in which the variance of a sensor gain may grow by its whole prior variance."""
     gain_correlation_time: float = 86400.0
     """Time [s] in which the autocorrelation of a gain error falls to 1/e: amplifiers drift, tyres wear."""
+
+
+@dataclass(frozen=True, slots=True)
+class StandingOptions:
+    """Prior sd of the standing parts of every model (`standing`); 0 holds one at none."""
+
+    relaxation_length: float = 0.1
+    """[m]: tyres relax over 0.05 to 0.3 m (Pacejka 2012, ch. 7)."""
+    wheel_inertia: float = 10.0
+    """[`wheel_mass_share` discs]: a motor behind its gear adds many times the wheel's own inertia."""
+    wheel_mass_share: float = 0.03
+    """Mass of a wheel over that of the vehicle [1]: 2.4 to 3.6 % of a robot, a tractor and a loader."""
+    load: float = 0.04
+    """Lateness of loads beside torque and wheel speed [s]: a cycle of 20 ms and a filter of 20 to 30 ms."""
+    ground_speed: float = 0.15
+    """[s]: a radar 0.05 to 0.15 s, receivers of positions 0.1 to 0.3 s."""
+    draft: float = 0.05
+    """[s]: as `load`, and a filter against the hitch's vibration."""
+    acceleration: float = 0.04
+    """[s], as `load`."""
+
+
+HELD = StandingOptions(0.0, 0.0, StandingOptions().wheel_mass_share, 0.0, 0.0, 0.0, 0.0)
+"""None of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class VarianceOptions:
+    """How variance components are learned from residuals (`variance_components`)."""
+
+    block: float = 1.0
+    """Length of a block [s]: an axle bounces at 1.5 to 3 Hz, so that a second holds whole cycles of it."""
+    memory: float = 30.0
+    """Windows [1] over which factors are averaged, one a hop: half a minute of the same ground."""
+    least: float = 0.25
+    """Least factor on a variance [1]: sensors twice as good as their data sheets say."""
+    most: float = 400.0
+    """Largest factor on a variance [1]: twenty times the sd of a data sheet, as loads that shake by 12 % have beside
+    cells of 0.8 %."""
+    least_share: float = 0.02
+    """Share of its own noise [1] an instant that corrections of a kind must show for its factor to be learned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +226,8 @@ class EstimatorOptions:
     search: SearchOptions = SearchOptions()
     posterior: PosteriorOptions = PosteriorOptions()
     tracker: TrackerOptions = TrackerOptions()
+    standing: StandingOptions = StandingOptions()
+    variance: VarianceOptions = VarianceOptions()
 
 
 ESTIMATOR = EstimatorOptions()

@@ -192,9 +192,7 @@ class Posterior:
         prior
             Of the soil.
         shift : (6,), optional
-            Of the logarithms, from this soil to the mean.  Then the result is the second moment about this soil: the
-            square of the shift is added.  Each parameter's shift is clipped to what its prior sd leaves beside its
-            own variance, because no parameter is known less than beforehand.
+            Of the logarithms, from this soil to the mean over the considered parameters.
         """
         free = prior.free
         if not len(free):
@@ -205,11 +203,11 @@ class Posterior:
         most = max(1.0, float(np.linalg.eigvalsh(own)[-1]))
         covariance = np.zeros_like(self.log_covariance)
         covariance[at] = (axes * np.clip(variance, 0.0, most)) @ axes.T * unit
-        if shift is not None:
-            room = np.sqrt(np.maximum(prior.log_std[free] ** 2 - covariance[free, free], 0.0))
-            clipped = np.clip(shift[free], -room, room)
-            covariance[at] += np.outer(clipped, clipped)
-        return Posterior(self.soil, covariance)
+        if shift is None:
+            return Posterior(self.soil, covariance)
+        logs = np.zeros(len(self.soil))
+        logs[free] = np.clip(shift[free], -prior.log_std[free], prior.log_std[free])
+        return Posterior(Soil(*(np.asarray(self.soil) * np.exp(logs)).tolist()), covariance)
 
     def distance(self, soil: Soil) -> float:
         """Mahalanobis distance of a soil, in sd, by all free parameters together."""

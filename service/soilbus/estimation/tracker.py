@@ -10,112 +10,54 @@
 
 A window is fitted as one soil, from the optimum of the last one (warm start).  Where the newest data disagree with
 that soil (change_detection) or it does not describe the window, another soil is searched for (`Tracker._explained`),
-and `next_state` says which soil the estimate is of:
+and `soil_state` says which soil the estimate is of.
 
-    STEADY       one soil; the recursion above
-    SUSPECT      a change point, and too few data after it for a second soil
-    TRANSITION   two soils have much more evidence than one, but the border may not be over: the second has the wide
-                 prior of a new soil and the gains of the recursion; data between the soils are left out
-    NEW_SOIL     the border is over and less than a window old; once it is out of the window, STEADY
-
-A fit that exceeds its chi-square limit is a mismatch and never a prior.  Searches from many starts are
+A fit that does not describe its data is a mismatch and never a prior.  Searches from many starts are
 limited by `SearchBudget`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.change_detection import ChangeStatistic, Transition, change_statistic, without_transition
-from soilbus.estimation.drift_filter import at_window_end
+from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.model_form import FormPosterior, form_posterior
-from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, refit_denoised, warm_start
+from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import (
-    RESIDUAL,
     TIME_TOLERANCE,
     ObservationModel,
     ObservationModelWithEffects,
-    Work,
 )
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
-from soilbus.estimation.path_curvature import (
-    curvature_of,
-    detected_curvature,
-    fit_on_curved_path,
-    straightened,
-    with_curvature,
-    without_curvature,
-)
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.prediction import Share, prediction_shares
+from soilbus.estimation.search_budget import SearchBudget
+from soilbus.estimation.soil_state import ChangePoint, Reason, Shown, SoilState, TrackerState, next_state
 from soilbus.estimation.solver import Objective
+from soilbus.estimation.variance_components import VarianceComponents, correction_ratios
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.terra.wheel import WheelModel
 
 __all__ = [
-    "ChangePoint",
-    "Reason",
-    "SearchBudget",
     "Settings",
-    "Shown",
-    "SoilState",
     "Tracker",
     "TrackerOutput",
-    "TrackerState",
     "gain_errors",
     "new_soil_prior",
-    "next_state",
 ]
 
 _SOIL = len(PARAMETERS)
-
-
-class TrackerState(StrEnum):
-    """Which soil a window's estimate is of."""
-
-    STEADY = "steady"
-    """The soil of the windows before."""
-    SUSPECT = "suspect"
-    """The newest data disagree with this soil, but are too few to estimate another; the estimate is of this soil."""
-    TRANSITION = "transition"
-    """Another soil; the border may not be over: its data do not agree yet."""
-    NEW_SOIL = "new_soil"
-    """Another soil for less than a window; only its own data count."""
-
-
-class Reason(StrEnum):
-    """Why a window has its state."""
-
-    ONE_SOIL = "one_soil"
-    """Its data agree with the soil of the windows before (steady)."""
-    TOO_FEW_DATA = "too_few_data"
-    """It has too few residuals to be fitted (steady)."""
-    UNCONFIRMED = "change_unconfirmed"
-    """The change statistic exceeds its threshold, but two soils are not much likelier than one (steady)."""
-    MISMATCH = "mismatch"
-    """No soil describes it (steady), or its newest part (suspect)."""
-    CHANGE_STATISTIC = "change_statistic"
-    """The change statistic exceeds its threshold (suspect)."""
-    TWO_SOILS = "two_soils_likelier"
-    """Two soils have much more evidence than one (new soil)."""
-    ANOTHER_SOIL = "prior_conflict"
-    """Its data conflict with the present soil's prior and are of another one (new soil)."""
-    SPANS_BORDER = "window_spans_border"
-    """The last border is less than a window ago (new soil)."""
-    UNSETTLED = "unsettled"
-    """The fit of the new soil exceeds its chi-square limit just after a border (transition)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +72,6 @@ class Settings:
         Ground speed [m/s] up to which instants are left out.
     max_turn : float
         Relative difference of an axle's rim speeds above which instants are left out.
-    max_chi2 : float
-        Reduced chi-square allowed on average.
     drift : float
         Sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time.
     min_rows : int
@@ -147,100 +87,12 @@ class Settings:
     window: float
     min_speed: float
     max_turn: float
-    max_chi2: float
     drift: float
     min_rows: int = 60
     form: tuple[float, ...] = ()
     search_rate: float = 4.0
     search_burst: float = 100.0
     hop: float = 1.0
-
-
-class ChangePoint(NamedTuple):
-    """Time t [s] from which the data disagree with the present soil, ground speed [m/s] then, and why."""
-
-    t: float
-    speed: float
-    statistic: ChangeStatistic
-
-
-@dataclass(frozen=True, slots=True)
-class SoilState:
-    """Which soil the windows are of.
-
-    Attributes
-    ----------
-    name, reason
-        The state, and why it is so.
-    transition
-        The last one: data before its end are of another soil.
-    change
-        A change point that no other soil explains yet.
-    mismatch
-        Whether the last fit was a mismatch.
-    """
-
-    name: TrackerState = TrackerState.STEADY
-    reason: Reason = Reason.ONE_SOIL
-    transition: Transition | None = None
-    change: ChangePoint | None = None
-    mismatch: bool = False
-
-    def spans_border(self, start: float) -> bool:
-        """Whether a window from `start` [s] on may still have data of another soil."""
-        is_open = self.name is TrackerState.TRANSITION and self.mismatch
-        return self.transition is not None and (is_open or start < self.transition.end)
-
-
-class Shown(NamedTuple):
-    """What a window shows.
-
-    Attributes
-    ----------
-    found
-        Why data before the end of `transition` are of another soil than those after it, or before `change` than those
-        after it; None where they are of the soil of the window before.
-    transition
-        The last transition, found now or before.
-    change
-        The change point, where there is one.
-    mismatch, settled
-        Whether the fit exceeds its limit of chi-square; whether it keeps that just after a border.
-    """
-
-    found: Reason | None
-    transition: Transition | None
-    change: ChangePoint | None
-    mismatch: bool
-    settled: bool
-
-
-def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
-    """State after a window that ended at `end` [s], of length `window` [s].
-
-    Parameters
-    ----------
-    state : SoilState
-        After the window before.
-    shown : Shown
-        What the window shows.
-    end, window : float
-        [s].
-
-    Returns
-    -------
-    SoilState
-    """
-    S, transition, now = TrackerState, shown.transition, replace(state, change=shown.change, mismatch=shown.mismatch)
-    if shown.found in (Reason.CHANGE_STATISTIC, Reason.MISMATCH):
-        return replace(now, name=S.SUSPECT, reason=shown.found)
-    if transition is None or not (shown.found or state.spans_border(end - window)):
-        one = Reason.ONE_SOIL if shown.change is None else Reason.UNCONFIRMED
-        return replace(now, name=S.STEADY, reason=Reason.MISMATCH if shown.mismatch else one)
-    now = replace(now, transition=transition)
-    if not shown.settled:
-        return replace(now, name=S.TRANSITION, reason=Reason.UNSETTLED)
-    return replace(now, name=S.NEW_SOIL, reason=shown.found or Reason.SPANS_BORDER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +117,8 @@ class TrackerOutput:
         Why the state is so.
     change : ChangePoint or None
         The present change point.
+    prediction : Mapping of str to Share
+        By channel, how far the newest data are from what the windows before predict.
     """
 
     fit: Fit | None
@@ -276,6 +130,7 @@ class TrackerOutput:
     search_ended: bool = False
     reason: Reason = Reason.ONE_SOIL
     change: ChangePoint | None = None
+    prediction: Mapping[str, Share] = field(default_factory=dict)
 
 
 class _Present(NamedTuple):
@@ -333,6 +188,8 @@ class Tracker:
         self.effects, self.free = tuple(effects), tuple(free)
         self._new_soil_prior = new_soil_prior(prior)
         self._last_run: tuple[Gaussian, float] | None = None
+        self._components = VarianceComponents(rig.options.variance)
+        self._posteriors: list[tuple[float, Gaussian]] = []
         self.reset()
 
     @property
@@ -354,14 +211,32 @@ class Tracker:
         """Take the gains of the last run, `elapsed` seconds ago, as prior now and after each reset."""
         self._last_run = gaussian, elapsed
 
+    def start_from(self, other: Tracker, t: float) -> None:
+        """Take the soil that another tracker knows as prior from `t` [s] on: the machine changed, not the ground."""
+        known = other.newest_posterior
+        if known is None:
+            return
+        gains = gain_errors(self.rig, self.model, self.free)[1]
+        covariance = np.zeros((_SOIL + len(gains),) * 2)
+        covariance[:_SOIL, :_SOIL] = known.covariance[:_SOIL, :_SOIL]
+        covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] = gains**2
+        self._posteriors.append((t, Gaussian(known.soil, np.zeros(len(gains)), covariance)))
+        self._components = other.components
+
     def reset(self) -> None:
         """Forget all windows."""
         self._state = SoilState()
         self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
-        self._posteriors: list[tuple[float, Gaussian]] = []
+        self._posteriors = []
         self._newest_posterior: Gaussian | None = None
+        self._components = VarianceComponents(self.rig.options.variance)
+
+    @property
+    def components(self) -> VarianceComponents:
+        """What each kind of sensor is worth, by the windows so far."""
+        return self._components
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         """Estimate one window; windows come in their order.
@@ -390,17 +265,19 @@ class Tracker:
             return TrackerOutput(None, False, TrackerState.STEADY, present.since, *left_out, reason=Reason.TOO_FEW_DATA)
         self._discard_before(end - self.settings.window)
         one = self._one_soil(present)
+        if not self._components.weight:
+            present, one = self._with_components(present, window, end, one)
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)
         fit = explanation.fit
-        settled = fit is not None and self._is_settled(fit)
+        settled = not self.mismatch(fit)
         shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit), settled)
         state = next_state(self._state, shown, end, self.settings.window)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
-            reason=state.reason, change=state.change,
+            reason=state.reason, change=state.change, prediction=self._prediction(one),
         )  # fmt: skip
-        self._store(tracked, state, end, present.problem)
+        self._store(tracked, state, end, explanation.objective.problem)
         return tracked
 
     def _present(self, window: Window, end: float) -> _Present:
@@ -408,13 +285,14 @@ class Tracker:
         start, transition = end - self.settings.window, self._state.transition
         since = start if transition is None else max(transition.end, start)
         if transition is not None:
-            window = without_transition(window, transition, self.rig.front)
+            window = without_transition(window, transition, self.rig.ahead)
             window = window.rows(np.flatnonzero(window.t >= transition.end))
         problem = self._problem(window)
         return _Present(window, problem, self._prior_at(since, problem), since, end)
 
     def _problem(self, window: Window) -> ObservationModel:
         speed, turn = self.settings.min_speed, self.settings.max_turn
+        window = self._components.scaled(window, self.rig)
         problem = ObservationModelWithEffects(window, self.rig, self.model, speed, turn, self.effects, self.free)
         problem.work = self._budget.work
         return problem
@@ -422,31 +300,44 @@ class Tracker:
     def _one_soil(self, present: _Present) -> _Explanation:
         """The window as one soil, the present one: from the optimum of the last window, else from many starts."""
         last = self._fit
-        if last is None or (last.second_mode is not None and self._budget.allows()):
+        if last is None:
             return self._searched(present)
         warm = warm_start(present.problem, self.soil_prior, last, present.joint_prior)
         fit = fit_warm(warm)
-        if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
-            fit = refit_denoised(warm.objective, fit)  # slow convergence in a valley is no sign of a new soil
         if fit is None or not fit.converged:
             fit = self._search(present.problem, self.soil_prior, present.joint_prior) or fit
-        return self._on_straight_path(present, warm.objective, fit)._replace(warm=warm)
+        return _Explanation(warm.objective, fit, present.since, warm, transition=self._state.transition)
 
     def _searched(self, present: _Present) -> _Explanation:
         """The window as one soil, the present one, from many starts."""
         fit = self._search(present.problem, self.soil_prior, present.joint_prior)
         objective = Objective(present.problem, self.soil_prior, present.joint_prior)
-        return self._on_straight_path(present, objective, fit)
+        return _Explanation(objective, fit, present.since, transition=self._state.transition)
 
-    def _on_straight_path(self, present: _Present, objective: Objective, fit: Fit | None) -> _Explanation:
-        """The fit with detected path curvature removed; not just after a border, whose residuals that would hide."""
-        transition = self._state.transition
-        is_near_border = transition is not None and present.end < transition.end + self.settings.window
-        path = None if is_near_border else detected_curvature(objective, fit)
-        if fit is not None and path is not None:
-            straight = self._problem(straightened(present.window, self.rig, path))
-            objective, fit = fit_on_curved_path(objective, fit, path, straight)
-        return _Explanation(objective, fit, present.since, transition=transition)
+    def _with_components(
+        self, present: _Present, window: Window, end: float, one: _Explanation
+    ) -> tuple[_Present, _Explanation]:
+        """The first window again, until its own residuals say what its sensors are worth."""
+        for _ in range(self.options.first_rounds):
+            fit, work_before = one.fit, self._budget.work.instants
+            if fit is None or not self._budget.allows():
+                break
+            ratios = correction_ratios(one.objective.problem, fit.optimum, self._components.options)
+            self._components = self._components.after(ratios, whole=True)
+            present = self._present(window, end)
+            warm = warm_start(present.problem, self.soil_prior, fit, present.joint_prior)
+            one = _Explanation(warm.objective, fit_warm(warm) or fit, present.since, None, transition=one.transition)
+            self._budget.spend(work_before)
+        if self.mismatch(one.fit):  # what no soil explains says nothing of the sensors
+            self._components = VarianceComponents(self.rig.options.variance)
+        return present, one
+
+    def _prediction(self, one: _Explanation) -> Mapping[str, Share]:
+        """The newest data beside their prediction by the last window's estimate."""
+        if one.warm is None or one.warm.model is None or self._fit is None:
+            return {}
+        problem, last = one.warm.objective.problem, float(self._fit.optimum.t[-1])
+        return prediction_shares(problem, one.warm.model.linearisation, last, self.rig.options.variance.block)
 
     def _change_point(self, present: _Present, one: _Explanation) -> ChangePoint | None:
         """Where the newest data disagree with the present soil; what it was while nothing explains the data since."""
@@ -459,30 +350,26 @@ class Tracker:
             return change if self.mismatch(fit) else None
         if self._good_until <= present.end - length or present.end - present.since <= options.min_to_detect * length:
             return None
-        if fit is not None and fit.curved_path and self._is_settled(fit):
-            return None  # path curvature explains the disagreement
         t = warm.objective.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - options.min_to_detect * length))
-        centred = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
+        centred = replace(last.mode, soil=last.optimum.soil, gains=last.optimum.gains)
         half_window = 0.5  # the last estimate is of its window's middle
         predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
         false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
         found = change_statistic(warm.objective, predicted, warm.iterate, at.linearisation, first, false_alarms)
-        if not found.is_alarm and fit is not None and fit.chi2 <= self.chi2_limit(fit):
+        if not found.is_alarm and not self.mismatch(fit):
             return None
         begin, window = float(t[found.instant]), present.window
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
         return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed), found)
 
     def _explained(self, present: _Present, one: _Explanation, change: ChangePoint | None) -> _Explanation:
-        """The window as two soils from the change point on, as another soil, or as one that begins later."""
+        """The window as two soils from the change point on, or as another soil."""
         two = None if change is None else self._two_soils(present, one, change)
         if two is not None:
             return two
-        if self.mismatch(one.fit) and self._budget.allows():
+        if (one.warm is None or self.mismatch(one.fit)) and self._budget.allows():
             one = self._another_soil(present, one if one.warm is None else self._searched(present))
-        if one.found or self._state.spans_border(present.end - self.settings.window):
-            one = self._after_longer_transition(present, one)
         return one
 
     def _two_soils(self, present: _Present, one: _Explanation, change: ChangePoint) -> _Explanation | None:
@@ -506,7 +393,7 @@ class Tracker:
             window, candidates, self._new_soil_prior, joint_prior, lambda fit: not self.mismatch(fit)
         )
         if new is not None and new.transition is not None:
-            separated = without_transition(window, new.transition, self.rig.front)
+            separated = without_transition(window, new.transition, self.rig.ahead)
             whole = present._replace(window=separated, problem=self._problem(separated))
             if old is not None and not self._are_likelier(old, new.fit, self._searched(whole).fit):
                 return None
@@ -529,7 +416,7 @@ class Tracker:
         None where none does, or too few data are left.
         """
         for transition in transitions:
-            separated = without_transition(window, transition, self.rig.front)
+            separated = without_transition(window, transition, self.rig.ahead)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
             arrived = transition.end + transition.lag if self._state.mismatch else transition.end
             if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
@@ -556,29 +443,18 @@ class Tracker:
 
     def _another_soil(self, present: _Present, one: _Explanation) -> _Explanation:
         """The window as one soil, a new one where the prior of the present one conflicts with the data."""
-        if not (self.mismatch(one.fit) and self._posteriors):
+        if not self._posteriors:
             return one
         joint_prior = present.joint_prior.with_prior_soil(self._new_soil_prior)
-        other = self._search(present.problem, self._new_soil_prior, joint_prior)
-        if self.mismatch(other):
+        fit, other = one.fit, self._search(present.problem, self._new_soil_prior, joint_prior)
+        if other is None or self.mismatch(other):
+            return one
+        gain = math.inf if fit is None or self.mismatch(fit) else fit.neg2_log_evidence - other.neg2_log_evidence
+        if gain < self.options.significance:
             return one
         begin = float(present.problem.t[0])
         objective = Objective(present.problem, self._new_soil_prior, joint_prior)
         return _Explanation(objective, other, begin, None, Reason.ANOTHER_SOIL, Transition(begin, begin, 0.0))
-
-    def _after_longer_transition(self, present: _Present, one: _Explanation) -> _Explanation:
-        """The new soil after a longer transition, if the data that it leaves out are why the others do not agree."""
-        if one.fit is None or self._is_settled(one.fit) or one.transition is None:
-            return one
-        prior, joint_prior = one.objective.coordinates.prior, one.objective.joint_prior
-        begin, last = max(one.transition.end, float(present.window.t[0])), float(present.window.t[-1])
-        ends = (begin + share * (last - begin) for share in self.options.extension_shares)
-        longer = (one.transition._replace(end=end) for end in ends)
-        after = self._after_transition(present.window, longer, prior, joint_prior, self._is_settled)
-        if after is None or after.fit is None:
-            return one
-        fall = one.fit.neg2_log_posterior - after.fit.neg2_log_posterior - (one.fit.rows - after.fit.rows)
-        return after._replace(found=one.found or Reason.SPANS_BORDER) if fall > self.options.significance else one
 
     def _search(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
         """A fit from many starts; None also where the budget allows no search."""
@@ -589,40 +465,25 @@ class Tracker:
         self._budget.spend(work_before)
         return fit
 
-    def _is_settled(self, fit: Fit) -> bool:
-        """Whether the chi-square of a new soil's fit keeps its limit just after a border."""
-        limit = self.settings.max_chi2 + self.options.settled_sd * math.sqrt(2.0 / max(fit.rows, 1))
-        return fit.converged and fit.chi2 <= limit
-
     def mismatch(self, fit: Fit | None) -> bool:
-        """Whether a fit failed or its chi-square exceeds the limit."""
-        return fit is None or not fit.converged or fit.chi2 > self.chi2_limit(fit)
+        """Whether a fit failed, or fits much worse than the windows before: its data may be of several soils."""
+        return fit is None or not fit.converged or self.is_of_several_soils(fit)
 
-    def chi2_limit(self, fit: Fit) -> float:
-        """Limit of a fit's reduced chi-square: `max_chi2` + sd sqrt(2 / residuals)."""
-        deviations = 0.0 if self._state.mismatch else self.options.mismatch_sd
-        return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
+    def is_of_several_soils(self, fit: Fit) -> bool:
+        """Return whether residuals are larger than what earlier windows left: data of several soils, or a new fault."""
+        return math.isfinite(fit.chi2) and fit.chi2 > self.options.several_soils
 
     def _prior_at(self, t: float, problem: ObservationModel) -> Gaussian:
-        """Joint prior of a window from t [s] on: soil, gains, and the window's own unknown path curvature."""
-        return with_curvature(self._prior_without_path_curvature(t, problem), curvature_of(problem))
-
-    def _prior_without_path_curvature(self, t: float, problem: ObservationModel) -> Gaussian:
         """Posterior of the newest window that ended by t [s], plus drift since."""
         ended = self._ended(t)
         if not ended:
             return self._initial_prior(problem)
         end, gaussian = self._posteriors[ended[-1]]
-        elapsed = (t - end) / self.settings.window
-        gains = problem.gain_std**2 * min((elapsed + 1.0) / self.options.gain_memory, 1.0)
+        elapsed = (t - end) / self.settings.window + 1.0  # from the middle of that window to the middle of this one
+        gains = problem.gain_std**2 * min(elapsed / self.options.gain_memory, 1.0)
         if self._state.transition is not None and end <= self._state.transition.end:
             return gaussian.with_prior_soil(self.soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        form = (
-            None
-            if gaussian.form is None
-            else gaussian.form.drifted(self.settings.form, elapsed / self.options.gain_memory)
-        )
-        return replace(gaussian.drifted(self._drift(gaussian, elapsed), gains), form=form)
+        return gaussian.drifted(self._drift(gaussian, elapsed), gains)
 
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
         """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
@@ -653,95 +514,39 @@ class Tracker:
         self._posteriors = self._posteriors[max([0, *self._ended(start)]) :]
 
     def _reported(self, objective: Objective, fit: Fit | None) -> Fit | None:
-        """The fit as it is reported: with nested Laplace moments and open form, of the soil at the window's end."""
+        """The fit as it is reported: with what the form of the contact leaves open."""
         if fit is None or not fit.converged:
             return fit
-        if not self.mismatch(fit):
-            off_scale = sinkages_off_scale(objective, fit, self.options.significance)
-            fit = with_nested_laplace(objective.problem, objective.coordinates.prior, objective.joint_prior, fit)
-            fit = replace(fit, off_scale=off_scale)
-        fit = replace(fit, form=self._form_posterior(objective, fit))
-        return at_window_end(objective, fit, self.settings.window, self.settings.drift)
+        form = self._form_posterior(objective, fit)
+        half = self.options.steady_drift * self.settings.drift / 2.0  # from a window's middle to its end
+        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(fit.mode.soil)
+        mode = fit.mode.drifted(half**2 * (directions @ directions.T), np.zeros(len(fit.gains)))
+        return replace(fit, mode=mode, form=form)
 
     def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:
         """Part of a fit that the form of the model leaves open; None where the form is held."""
         if not any(self.settings.form):
             return None
-        joint_prior = objective.joint_prior.form or FormPosterior.of(self.settings.form, len(fit.gains))
+        prior = FormPosterior.of(self.settings.form, len(fit.gains))
+        if objective.joint_prior.form is not None:
+            prior = replace(prior, by_form=objective.joint_prior.form.by_form)
         with np.errstate(all="ignore"):
-            return form_posterior(objective, fit, joint_prior)
+            return form_posterior(objective, fit, prior)
 
     def _store(self, tracked: TrackerOutput, state: SoilState, end: float, problem: ObservationModel) -> None:
         """Store the result for later windows; a mismatch does not become a prior."""
         fit, self._state, self._fit = tracked.fit, state, None
-        if fit is not None and fit.converged:  # the next window's data have their path curvature again
-            self._fit = (
-                fit if fit.curved_path is None else replace(fit, optimum=fit.curved_path.optimum, curved_path=None)
-            )
+        if fit is not None and fit.converged:
+            self._fit = fit
         if fit is None or tracked.mismatch:
             return
         self._good_until = end
-        learned = end - tracked.since >= self.options.min_to_learn * self.settings.window and fit.is_gaussian
+        ratios = correction_ratios(problem, fit.optimum, self._components.options)
+        self._components = self._components.after(ratios)
+        learned = end - tracked.since >= self.options.min_to_learn * self.settings.window
         if learned and state.name in (TrackerState.STEADY, TrackerState.NEW_SOIL):
-            curvature = curvature_of(problem)
-            posterior = without_curvature(fit.mode.likelihood_factor(self.soil_prior), curvature)
-            self._posteriors.append((end, replace(posterior, form=fit.form)))
-            self._newest_posterior = without_curvature(fit.reported, curvature)
-
-
-class SearchBudget:
-    """Token bucket of model evaluations for searches, counted in whole windows, so that a replay is reproducible.
-
-    Parameters
-    ----------
-    rate : float
-        Evaluations that each window adds.
-    burst : float
-        Most evaluations that are kept for later.
-
-    Notes
-    -----
-    A window that follows another needs a few evaluations.  At a start, a border or after a gap
-    a search from many soils is due, and soon succeeds.  Where the model does not describe the
-    data no search succeeds, window after window; the empty bucket then limits the cost.
-
-    References
-    ----------
-    Turner 1986, IEEE Communications 24(10):8.
-
-    Examples
-    --------
-    >>> budget = SearchBudget(rate=4.0, burst=10.0)
-    >>> budget.next_window(instants=200)
-    >>> budget.allows()
-    True
-    >>> before = budget.work.instants
-    >>> budget.work.instants += 2000  # ten evaluations of the window
-    >>> budget.spend(before)
-    >>> budget.allows()
-    False
-    """
-
-    def __init__(self, rate: float, burst: float) -> None:
-        self.work = Work()
-        self._rate, self._burst = rate, burst
-        self._remaining, self._window = burst, 1
-        self.ended = False
-
-    def next_window(self, instants: int, refill: bool = False) -> None:
-        """A window of N instants begins; refill: the model described recent data, so the bucket is filled."""
-        self._remaining = self._burst if refill else min(self._remaining + self._rate, self._burst)
-        self._window = max(instants, 1)
-        self.ended = False
-
-    def allows(self) -> bool:
-        """Whether evaluations remain for a search; if not, `ended` is set."""
-        self.ended = self.ended or self._remaining <= 0.0
-        return self._remaining > 0.0
-
-    def spend(self, work_before: int) -> None:
-        """Take the evaluations since `work_before` [instants] from the bucket, which one search may overdraw."""
-        self._remaining -= (self.work.instants - work_before) / self._window
+            self._posteriors.append((end, replace(fit.mode.likelihood_factor(self.soil_prior), form=fit.form)))
+            self._newest_posterior = fit.mode
 
 
 def new_soil_prior(prior: SoilPrior) -> SoilPrior:
@@ -805,51 +610,3 @@ def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list
     """Names and prior sd (G,) of a vehicle's nuisance parameters: sensor gains, then effect parameters."""
     problem = ObservationModelWithEffects(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
     return problem.gain_names, problem.gain_std
-
-
-def sinkages_off_scale(objective: Objective, fit: Fit, max_statistic: float) -> bool:
-    """Whether the sinkages of all wheels, or of one wheel, would fit much better times a factor.
-
-    Parameters
-    ----------
-    objective : Objective
-        Of the fitted window.
-    fit : Fit
-        Its fit.
-    max_statistic : float
-        Score statistic, chi-square with one degree of freedom, above which it is so.
-
-    Returns
-    -------
-    bool
-        False where sinkage is not measured.
-
-    Notes
-    -----
-    Sinkage sensors that read 10 % too little lead to another soil, which explains the rest
-    nearly as well: chi-square rises by a tenth, which passes for noise, while bearing pressures
-    are wrong by a fifth.  But no soil makes all sinkages, or those of one wheel, proportionally
-    larger, so a score test along this direction separates the two, at the optimum and without
-    another fit.  The information of the scale is taken as if loads and speeds had no noise,
-    so the statistic is a little underestimated.
-
-    References
-    ----------
-    Rao 1948, Proc. Camb. Phil. Soc. 44:50.
-    """
-    problem, optimum = objective.problem, fit.optimum
-    approximation = objective.approximation_at(optimum)
-    if not problem.with_sinkage or approximation is None:
-        return False
-    at, soil = optimum.at, Soil(*optimum.soil.tolist())
-    (n, m), wheels = at.by_latents.shape[:2], problem.n_wheels
-    sinkage = np.where(problem.has_sinkage, problem.sinkages(soil, optimum.gains, optimum.latents), 0.0)
-    weighed = at.weighed.reshape(n, m, -1)[:, problem.layout.sinkages]
-    of_wheels = np.einsum("iw,iwk->wk", sinkage, weighed)
-    of_gradient, of_information = approximation.explained(of_wheels @ approximation.directions)
-    gradient = of_wheels[:, RESIDUAL] - of_gradient
-    square = np.divide(sinkage**2, problem.sinkage_var, where=problem.has_sinkage, out=np.zeros((n, wheels)))
-    information = np.diag(square.sum(axis=0)) - of_information
-    scales = np.vstack([np.ones(wheels), np.eye(wheels)[sinkage.any(axis=0)]])
-    fall = (scales @ gradient) ** 2 / np.einsum("sw,wv,sv->s", scales, information, scales)
-    return bool(fall.max() > max_statistic)

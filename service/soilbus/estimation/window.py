@@ -71,14 +71,14 @@ class SensorNoise(NamedTuple):
 class Rig:
     """The vehicle or test rig: W wheels, their geometry, the sensors' noise.
 
-    radius and width [m] have shape (W,); front (W,) marks the wheels of the front axle;
-    chassis is None for a test rig, whose drawbar pull is measured as draft.
+    radius and width [m] have shape (W,); ahead (W,) is the distance to the last axle over the wheelbase, 1 on the front
+    axle; chassis is None for a test rig, whose drawbar pull is measured as draft.
     """
 
     wheels: tuple[str, ...]
     radius: Array
     width: Array
-    front: NDArray[np.bool_]
+    ahead: Array
     chassis: Chassis | None
     noise: Mapping[str, SensorNoise]
     track: float | None = None
@@ -115,6 +115,16 @@ class Rig:
             for w, name in zip(self.wheels, self.names.get(q, self.wheels), strict=True)
         )  # fmt: skip
         return per_wheel + VEHICLE_QUANTITIES
+
+    @property
+    def front(self) -> NDArray[np.bool_]:
+        """(W,), which wheels are on the front axle."""
+        return np.asarray(self.ahead == 1.0)
+
+    @property
+    def axles(self) -> list[list[int]]:
+        """The wheels of each axle, from the front to the rear."""
+        return [np.flatnonzero(self.ahead == at).tolist() for at in np.unique(self.ahead)[::-1]]
 
     @property
     def drives(self) -> NDArray[np.bool_]:
@@ -306,12 +316,12 @@ def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:
 
 def pairs(rig: Rig) -> NDArray[np.intp]:
     """Left and right wheels (2, P) of the axles that have two; the left one is configured first."""
-    return _pairs_of_front(tuple(rig.front.tolist()))
+    return _pairs(tuple(rig.ahead.tolist()))
 
 
 @cache
-def _pairs_of_front(front: tuple[bool, ...]) -> NDArray[np.intp]:
-    axles = [[i for i, is_front in enumerate(front) if is_front == wanted] for wanted in (True, False)]
+def _pairs(ahead: tuple[float, ...]) -> NDArray[np.intp]:
+    axles = [[i for i, at in enumerate(ahead) if at == axle] for axle in sorted(set(ahead), reverse=True)]
     return np.array([wheels for wheels in axles if len(wheels) == 2], np.intp).reshape(-1, 2).T
 
 

@@ -78,7 +78,7 @@ def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Con
     if problem.rig.chassis is None:
         return None
     model = UncertainModel.of(
-        problem.model, fitted.effects, fitted.free, fitted.fits[record].reported, len(problem.rig.wheels),
+        problem.model, fitted.effects, fitted.free, fitted.fits[record].mode, len(problem.rig.wheels),
         float(latents.ground_speed.mean()),
     )  # fmt: skip
     limit = ReportedLimits(motors_of(config, problem.rig)).at(0.0)

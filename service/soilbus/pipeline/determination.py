@@ -3,7 +3,9 @@
     excitation   sd of draft and slip = sqrt(max(sample variance - mean noise variance, 0)):  load determines the
                  bearing modulus, slip the shear strength
     load_range   lacks where  std p(z) > max_bearing_std p(z),   z: z_ref, within the depths that carry load
-    slip_range   lacks where  std tan phi > max_tan_phi_std tan phi  and  std tau > max_tan_phi_std tau,
+    slip_range   lacks where  std of the largest draft > max_draft_std max(|largest draft|, LEAST_DRAFT weight);
+                 of a test rig where
+                 std tan phi > max_tan_phi_std tan phi  and  std tau > max_tan_phi_std tau,
                  tau = c + p tan phi at the contact's own pressure p = W / (b l)
 
 Below a wheel pressure rises from 0 at the edge of the contact to its sinkage: all depths from 0 to there carry load.
@@ -23,10 +25,22 @@ from soilbus.config.model import Estimator
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window
-from soilbus.terra.vehicle import slip_ratio
+from soilbus.terra.vehicle import GRAVITY, slip_ratio
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, sinkage
 
-__all__ = ["Excitation", "contact_pressure", "excitation_of", "lacking", "loaded_depths", "sinkage_range"]
+__all__ = [
+    "Excitation",
+    "contact_pressure",
+    "draft_is_known",
+    "excitation_of",
+    "lacking",
+    "loaded_depths",
+    "sinkage_range",
+]
+
+LEAST_DRAFT = 0.1
+"""Draft [1], over the weight, below which a relative error says little: a machine that can pull nothing is known as
+well as one that can.  A tenth is what wheels resist on soft fields (0.05 to 0.1, Wong 2008, fig. 2.60)."""
 
 
 class Excitation(NamedTuple):
@@ -63,16 +77,27 @@ def _spread(value: Array, variance: Array) -> tuple[float | None, float | None]:
 
 
 def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
-    """What varied too little in a window: load_range, slip_range or both, as far as its posterior says so."""
-    posterior = fit.reported.posterior
+    """What varied too little in a window: load_range, slip_range or both, as far as its posterior says so.
+
+    Of a vehicle its largest draft says whether slip varied enough, see `draft_is_known`.
+    """
+    posterior = fit.posterior
     low, high = loaded_depths(fit, rig)
     bearing = posterior.bearing_pressure(min(max(settings.z_ref, low), high), settings.b_ref)
     sheared = posterior.tan_phi(), posterior.shear_strength(contact_pressure(fit, rig))
     lacks = {
         "load_range": _is_wide(bearing, settings.max_bearing_std),
-        "slip_range": all(_is_wide(estimate, settings.max_tan_phi_std) for estimate in sheared),
+        "slip_range": rig.chassis is None and all(_is_wide(e, settings.max_tan_phi_std) for e in sheared),
     }
     return [name for name, is_lacking in lacks.items() if is_lacking]
+
+
+def draft_is_known(draft: Estimate | None, rig: Rig, settings: Estimator) -> bool:
+    """Return whether the largest draft is known to `max_draft_std`; True where there is none to know."""
+    if draft is None or rig.chassis is None:
+        return True
+    size = max(abs(draft.value), LEAST_DRAFT * rig.chassis.mass * GRAVITY)
+    return draft.std <= settings.max_draft_std * size
 
 
 def loaded_depths(fit: Fit, rig: Rig) -> tuple[float, float]:

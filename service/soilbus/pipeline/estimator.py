@@ -10,8 +10,9 @@ loss of traction, immobilisation watch.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,22 +33,34 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import NO_LOSS, bins_of_a_moment, idle, motions, observed, slope_felt
+from soilbus.decision.traction_loss import (
+    NO_LOSS,
+    bins_of_a_moment,
+    disengaged,
+    idle,
+    motions,
+    observed,
+    shared_out,
+    slope_felt,
+)
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
-from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
+from soilbus.estimation.instrumentation import recompleted
 from soilbus.estimation.measurements import MASS_GAIN, gains_of
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
-from soilbus.estimation.posterior import NORMAL_95, Estimate, Posterior
+from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import Reason, Settings, Tracker, TrackerOutput, TrackerState
+from soilbus.estimation.soil_state import Reason, TrackerState
+from soilbus.estimation.standing import STANDING, wheel_inertia
+from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput
 from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
-from soilbus.pipeline.determination import excitation_of, lacking, sinkage_range
+from soilbus.pipeline.determination import draft_is_known, excitation_of, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask, input_rejected
-from soilbus.pipeline.model_gap import GapWatch, squares
+from soilbus.pipeline.model_gap import GapWatch, PredictionWatch, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.effects.steady import CompletedModel
@@ -109,7 +122,7 @@ class WindowEstimator:
         self._effects_and_parameters = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
-        self._gap = GapWatch(config.estimator.window, config.estimator.hop)
+        self._gap, self._predictions = GapWatch(), PredictionWatch(config.estimator.window)
         shared = [f"load.{wheels[0].name}" for wheels in config.same_signal("load") if len(wheels) > 1]
         self._mismatch = " ".join(["model_mismatch", *shared])
         self._held = Held()
@@ -123,18 +136,39 @@ class WindowEstimator:
         self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         of_tracker = Settings(
-            settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift,
+            settings.window, settings.min_speed, settings.max_turn, settings.soil_drift,
             form=form_of(config), search_rate=settings.search_rate, search_burst=settings.search_burst,
             hop=settings.hop,
         )  # fmt: skip
         if config.table is not None:
             of_tracker = replace(of_tracker, min_rows=1)  # a table's rows are chosen with care, and few
-        self._tracker = tracker_of(self.rig, self.prior, self.model, of_tracker, *self._effects_and_parameters)
+        self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
+        self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
+        self._driven_rig = self.rig
+        self._tracker = self._new_tracker()
 
     @property
     def tracker(self) -> Tracker:
         """The tracker, which carries soil and gains from window to window."""
         return self._tracker
+
+    def _new_tracker(self) -> Tracker:
+        effects, free = self._effects_and_parameters
+        return self._tracker_of(self._driven_rig, effects=effects, free=free)
+
+    def _follow_clutch(self, task: WindowTask) -> Window:
+        """The window's data since an axle was engaged or disengaged; the tracker is of the machine as it is now."""
+        since = -math.inf if task.fresh else task.end - self._settings.hop
+        apart = disengaged(task.window, self.rig, since, self._apart)
+        if (apart != self._apart).any():
+            self._apart, self._engaged_at = apart, since
+            self._driven_rig = with_disengaged(self.config, self.rig, apart)
+            before, self._tracker = self._tracker, self._new_tracker()
+            self._gain_names, self._gain_std = gains_of(self._driven_rig)
+            self._tracker.start_from(before, since)
+            self._predictions = PredictionWatch(self._settings.window)
+        window = task.window.rows(np.flatnonzero(task.window.t > self._engaged_at))
+        return recompleted(window, self.rig, self._driven_rig)
 
     def solve(self, task: WindowTask) -> WindowResult:
         """Result of one window, with decision and watch; windows in their order."""
@@ -148,12 +182,14 @@ class WindowEstimator:
         """Soil and status of one window; windows in their order."""
         if task.fresh:
             self._tracker.reset()
-        tracked = self._tracker.estimate(task.window, task.end)
+            self._engaged_at = -math.inf
+        tracked = self._tracker.estimate(self._follow_clutch(task), task.end)
         fit = tracked.fit
+        self._watch_model(task, tracked)
         status, reason = self._status(task, tracked)
         own = posterior = None
         if fit is not None and status is not Status.INVALID:
-            own = posterior = fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
+            own = posterior = fit.mode.posterior.widened(_widening(fit), self.prior)
             if fit.form is not None:
                 posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
         basis = self._basis(task, fit)
@@ -177,11 +213,14 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
-            gaps=self._model_gaps(task, fit),
+            gaps=self._predictions.gaps(self._settings.max_prediction_error),
+            prediction_error=self._predictions.shares(),
+            standing=self._standing(fit),
+            noise_factors={kind: math.sqrt(f) for kind, f in self._tracker.components.factor.items()},
             channel_chi2=self._gap.chi2(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
-            z_driven=None if fit is None or posterior is None else sinkage_range(fit, self.rig),
+            z_driven=None if fit is None or posterior is None else sinkage_range(fit, self._driven_rig),
             search_ended=tracked.search_ended,
             soil_change=_soil_change(tracked),
             shows_strength=fit is not None and self._shows_strength(fit),
@@ -193,7 +232,10 @@ class WindowEstimator:
         demand = present_demand(window, rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
         corrections = Corrections(self._torque_ceiling(task, window), effects)
-        result, limit = replace(result, corrections=corrections), corrections.torque_limit(task.torque_limit)
+        result, limit = (
+            replace(result, corrections=corrections),
+            corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig)),
+        )
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
@@ -216,7 +258,14 @@ class WindowEstimator:
             window.posterior, window.result.status, window.demand, window.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
-        return replace(window.result, traversability=self._with_state(decision, window))
+        result = window.result
+        if result.reason in ("none", "not_excited load_range") and not draft_is_known(
+            decision.max_draft, window.rig, self._settings
+        ):
+            lacks = [*result.reason.split()[1:], "slip_range"]
+            result = replace(result, status=Status.NOT_EXCITED, reason=" ".join(["not_excited", *lacks]))
+            window = replace(window, result=result)
+        return replace(result, traversability=self._with_state(decision, window))
 
     def _with_state(self, decision: Traversability, window: Undecided) -> Traversability:
         """The decision with the state after hysteresis, and the time since the last valid window."""
@@ -246,13 +295,13 @@ class WindowEstimator:
         measured = np.where(np.isfinite(self._ceiling.limit), self._ceiling.limit, np.inf)
         return tuple(np.where(self._idle, 0.0, measured).tolist())
 
-    def _model_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
-        """The channels that have not fitted for minutes; windows with missing or poor inputs do not count."""
+    def _watch_model(self, task: WindowTask, tracked: TrackerOutput) -> None:
+        """Take a window's squares and predictions; those with missing or poor inputs do not count."""
         if task.fresh:
-            self._gap.forget()
-        if fit is not None and not task.missing and not task.poor:
-            self._gap.take(task.end, squares(fit.optimum.at, len(self.rig.wheels)))
-        return self._gap.gaps()
+            self._gap, self._predictions = GapWatch(), PredictionWatch(self._settings.window)
+        if tracked.fit is not None and not task.missing and not task.poor:
+            self._gap.take(task.end, squares(tracked.fit.optimum.at, len(self.rig.wheels)))
+            self._predictions.take(task.end, tracked.prediction)
 
     def _update_watch(self, window: Undecided) -> None:
         """Update loss of traction and watch by the last hop, with the curve of the window before."""
@@ -282,9 +331,9 @@ class WindowEstimator:
         speed, fit = self._usual_speed(window), tracked.fit
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
-        widening = _widening(tracked, fit)
+        widening = _widening(fit)
         return UncertainModel.of(
-            self.model, *self._effects_and_parameters, fit.reported, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, widening, fit.form
         )
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
@@ -301,17 +350,29 @@ class WindowEstimator:
     def _with_estimated_mass(self, tracked: TrackerOutput) -> Rig:
         """The rig with the mass m / (1 + gain of the weight) that the window estimates, where no load cell does."""
         if self.rig.chassis is None or MASS_GAIN not in self._gain_names:
-            return self.rig
+            return self._driven_rig
         error = self._gain(tracked, MASS_GAIN)
         chassis = replace(self.rig.chassis, mass=self.rig.chassis.mass / (1.0 + error.value))
-        return replace(self.rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
+        return replace(self._driven_rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
 
     def _gain(self, tracked: TrackerOutput, name: str) -> Estimate:
         """A sensor's or row's gain error: posterior of the fit, else the prior."""
         index = self._gain_names.index(name)
         if tracked.fit is None or tracked.mismatch:
             return Estimate(0.0, self._gain_std[index])
-        return tracked.fit.reported.gain(index)
+        return tracked.fit.mode.gain(index)
+
+    def _standing(self, fit: Fit | None) -> dict[str, Estimate]:
+        """Return what a fit says of the standing parts that are not held, in SI."""
+        if fit is None or self.rig.chassis is None:
+            return {}
+        unit = {"wheel_inertia": float(wheel_inertia(self.rig).mean())}
+        gains = {name: fit.mode.gain(self._gain_names.index(name)) for name in STANDING}
+        return {
+            name: Estimate(unit.get(name, 1.0) * gain.value, unit.get(name, 1.0) * gain.std)
+            for name, gain in gains.items()
+            if gain.std > 0.0
+        }
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
@@ -361,25 +422,30 @@ class WindowEstimator:
                 return Status.INVALID, "input_stale " + " ".join(task.poor)
             is_short = tracked.reason is Reason.TOO_FEW_DATA
             return (Status.NOT_EXCITED, "not_excited few_bins") if is_short else (Status.INVALID, "no_convergence")
-        failure = self._failure(tracked)
-        if fit is None or failure is not None:
-            status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
-            return status, self._mismatch if failure == "model_mismatch" else "no_convergence"
+        if self._failure(tracked) is not None:
+            return Status.INVALID, "no_convergence"
+        if fit is None or not fit.converged:
+            return Status.INVALID, self._mismatch
+        if tracked.mismatch or self._contradicts(fit):
+            return Status.DEGRADED, self._mismatch
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
-        if fit.off_scale:
-            return Status.DEGRADED, self._mismatch
-        if self._ambiguous(fit):
-            return Status.NOT_EXCITED, "ambiguous"
-        if lacks := lacking(fit, self.rig, self._settings):
+        if lacks := lacking(fit, self._driven_rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
 
+    def _contradicts(self, fit: Fit) -> bool:
+        """Whether new data are far from their prediction, or a sensor's gain is far from what is configured of it."""
+        sensors = np.asarray(self._gain_std)
+        gains = np.abs(fit.gains[: len(sensors)])
+        too_far = bool((gains > self._settings.max_gain_error * sensors).any())
+        return too_far or self._predictions.error() > self._settings.max_prediction_error
+
     def _shows_strength(self, fit: Fit) -> bool:
         """Whether the window determines tan phi."""
-        tan_phi = fit.reported.posterior.tan_phi()
+        tan_phi = fit.mode.posterior.tan_phi()
         return tan_phi.std <= self._settings.max_tan_phi_std * tan_phi.value
 
     def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
@@ -389,21 +455,11 @@ class WindowEstimator:
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
     def _failure(self, tracked: TrackerOutput) -> str | None:
-        """Kind of failure of a solve: not_finite, model_mismatch or no_convergence; None for none."""
+        """Kind of failure of a solve: not_finite or no_convergence; None for none."""
         fit = tracked.fit
-        if not tracked.mismatch:
-            return None
         if fit is None:
-            return "model_mismatch" if tracked.search_ended else "not_finite"
-        return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
-
-    def _ambiguous(self, fit: Fit) -> bool:
-        """Whether a second mode has a bearing pressure or tan phi outside the first one's 95 % interval."""
-        if fit.second_mode is None:
-            return False
-        one, other = fit.mode.posterior, fit.second_mode.gaussian.posterior
-        pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
-        return any(abs(a.value - b.value) > NORMAL_95 * a.std for a, b in pairs)
+            return "not_finite" if tracked.mismatch and not tracked.search_ended else None
+        return None if fit.converged or self._tracker.is_of_several_soils(fit) else "no_convergence"
 
 
 def _soil_change(tracked: TrackerOutput) -> SoilChange:
@@ -418,6 +474,6 @@ def _gated(tracked: TrackerOutput) -> str:
     return "standstill" if tracked.standstill >= tracked.turning else "turning"
 
 
-def _widening(tracked: TrackerOutput, fit: Fit) -> float:
-    """Factor of a fit's covariance: its reduced chi-square where the window does not fit, else 1."""
-    return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
+def _widening(fit: Fit) -> float:
+    """Return the factor of a fit's covariance: its chi-square per residual where that is more than earlier ones."""
+    return max(fit.chi2, 1.0)

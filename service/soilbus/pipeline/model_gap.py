@@ -1,10 +1,10 @@
-"""Gap between model and data: reduced chi-square of each channel over minutes.
+"""How well the model describes a drive: chi-square of each channel, and errors of its predictions.
 
-    chi2(channel) = sum over its rows of r (M r) / number of rows   r: residual, M: inverse covariance of the instant
-    gap           chi2 > max(1.15, 1 + 5 sqrt(2 overlap / rows))         overlap = window / hop
+    chi2(channel)  = sum over its rows of r (M r) / number of rows   r: residual, M: inverse covariance of the instant
+    share(channel) = sqrt(sum of squares of errors / sum of squares of sizes)                (`estimation.prediction`)
 
-r (M r) has mean 1 where model and noise are right, so chi-square can be split by channel.  One window that does not fit
-means little; a channel that does not fit for minutes means a missing effect.
+Chi-square is in units of what the recording's own scatter says of each sensor, so that a machine that shakes has 1.  A
+gap is a channel that the model has predicted badly for minutes: a sign of a missing effect.
 """
 
 from __future__ import annotations
@@ -17,15 +17,12 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.prediction import Share
 
 SPAN = 120.0
-"""Time [s] over which chi-square is averaged."""
+"""Time [s] over which chi-square and gaps are averaged."""
 LEAST_SPAN = 60.0
 """Time [s] of windows below which no gap is reported."""
-LIMIT = 1.15
-"""Reduced chi-square of a channel from which a gap is reported."""
-DEVIATIONS = 5.0
-"""Standard deviations by which the reduced chi-square must exceed 1 as well."""
 
 
 class Square(NamedTuple):
@@ -36,7 +33,7 @@ class Square(NamedTuple):
 
 
 def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
-    """Squares of torque, draft and, where measured, sinkage in one fitted window, as far as they are finite.
+    """Return the squares of torque, draft and, where measured, sinkage in one fitted window, as far as finite.
 
     Parameters
     ----------
@@ -53,44 +50,83 @@ def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
     return {name: of for name, of in found.items() if of.rows and math.isfinite(of.total)}
 
 
+class _Sums:
+    """Sums by channel of what was taken in the last `span` seconds."""
+
+    def __init__(self, span: float) -> None:
+        self.span = span
+        self._seen: deque[tuple[float, Mapping[str, tuple[float, float]]]] = deque()
+
+    def take(self, end: float, found: Mapping[str, tuple[float, float]]) -> None:
+        """Add what ended at `end` [s]."""
+        self._seen.append((end, found))
+        while self._seen[0][0] <= end - self.span:
+            self._seen.popleft()
+
+    @property
+    def length(self) -> float:
+        """Time [s] from the first to the last that is kept."""
+        return self._seen[-1][0] - self._seen[0][0] if self._seen else 0.0
+
+    def ratios(self) -> dict[str, float]:
+        """Return the ratio of the two sums of each channel."""
+        sums: dict[str, list[float]] = {}
+        for _, found in self._seen:
+            for channel, pair in found.items():
+                total = sums.setdefault(channel, [0.0, 0.0])
+                total[0], total[1] = total[0] + pair[0], total[1] + pair[1]
+        return {channel: one / other for channel, (one, other) in sums.items() if other > 0.0}
+
+    def medians(self) -> dict[str, float]:
+        """Return the square root of the median ratio of each channel."""
+        ratios: dict[str, list[float]] = {}
+        for _, found in self._seen:
+            for channel, (one, other) in found.items():
+                if other > 0.0:
+                    ratios.setdefault(channel, []).append(one / other)
+        return {channel: float(np.sqrt(np.median(values))) for channel, values in ratios.items()}
+
+
 class GapWatch:
-    """Chi-square of each channel over the last SPAN of overlapping windows (window and hop in s)."""
+    """Chi-square of each channel over the last SPAN."""
 
-    def __init__(self, window: float, hop: float) -> None:
-        self._overlap = window / hop
-        self._seen: deque[tuple[float, Mapping[str, Square]]] = deque()
-        self._sums: dict[str, Square] = {}
-
-    def forget(self) -> None:
-        """Begin afresh."""
-        self._seen.clear()
-        self._sums = {}
+    def __init__(self) -> None:
+        self._sums = _Sums(SPAN)
 
     def take(self, end: float, found: Mapping[str, Square]) -> None:
         """Add one window that ended at `end` [s]."""
-        self._seen.append((end, found))
-        self._add(found, 1)
-        while self._seen[0][0] < end - SPAN:
-            self._add(self._seen.popleft()[1], -1)
-
-    def _add(self, found: Mapping[str, Square], sign: int) -> None:
-        """Add the squares of one window to the sums, or take them out again (sign -1)."""
-        for channel, square in found.items():
-            known = self._sums.get(channel, Square(0.0, 0))
-            self._sums[channel] = Square(known.total + sign * square.total, known.rows + sign * square.rows)
-
-    def gaps(self) -> dict[str, float]:
-        """Reduced chi-square of the channels that have not fitted for minutes, the worst first."""
-        if not self._seen or self._seen[-1][0] - self._seen[0][0] < LEAST_SPAN:
-            return {}
-        out = {
-            channel: known.total / known.rows
-            for channel, known in self._sums.items()
-            if known.rows
-            and known.total / known.rows > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / known.rows))
-        }
-        return dict(sorted(out.items(), key=lambda item: -item[1]))
+        self._sums.take(end, found)
 
     def chi2(self) -> dict[str, float]:
-        """Reduced chi-square of every channel, whether it fits or not."""
-        return {channel: known.total / known.rows for channel, known in self._sums.items() if known.rows}
+        """Return the reduced chi-square of every channel."""
+        return self._sums.ratios()
+
+
+class PredictionWatch:
+    """Errors of predictions over the last window [s], and over minutes."""
+
+    def __init__(self, window: float) -> None:
+        self._window, self._minutes = _Sums(window), _Sums(SPAN)
+
+    def take(self, end: float, found: Mapping[str, Share]) -> None:
+        """Add the newest data of a window that ended at `end` [s]."""
+        for sums in (self._window, self._minutes):
+            sums.take(end, found)
+
+    def shares(self) -> dict[str, float]:
+        """Return the error of each channel over its size, of the last window."""
+        return {channel: float(np.sqrt(ratio)) for channel, ratio in self._window.ratios().items()}
+
+    def error(self) -> float:
+        """Return the largest of the channels' usual shares; 0 before anything was predicted.
+
+        The median over hops: a moment that is spoilt, or on another soil, is no fault of the model.
+        """
+        return max(self._window.medians().values(), default=0.0)
+
+    def gaps(self, limit: float) -> dict[str, float]:
+        """Return the channels whose share has been above the limit for minutes, the worst first."""
+        if self._minutes.length < LEAST_SPAN:
+            return {}
+        found = {channel: float(np.sqrt(ratio)) for channel, ratio in self._minutes.ratios().items()}
+        return {c: share for c, share in sorted(found.items(), key=lambda item: -item[1]) if share > limit}

@@ -17,7 +17,7 @@ from soilbus.estimation.assembly import effects_of, model_of
 from soilbus.estimation.window import Rig, pairs
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.vehicle import GRAVITY, axle_loads
+from soilbus.terra.vehicle import GRAVITY, wheel_loads
 from soilbus.terra.wheel import Soil, state_on
 
 GROUND_SPEED = 1.5
@@ -58,15 +58,14 @@ def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
     rolling = np.where(np.asarray(length) > 0.0, 0.0, rig.options.measurements.rolling_slip)
     slip = np.where(rig.drives[:, None], slip, rolling)
     radius, width, rear = rig.radius[:, None], rig.width[:, None], ~rig.front[:, None]
-    share = np.ones((len(rear), len(t))) / np.where(rear, rear.sum(), (~rear).sum())
+    share = np.ones((len(rear), len(t)))
     share[pairs(rig)] *= 1.0 + SIDE_LOAD_SHARE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]
     model = CompletedModel.of(model_of(config), effects_of(config), GROUND_SPEED)
     state = state_on(Soil(*(prior.value for prior in config.soil_prior.values())), np.nan, slip, radius, width, length)
     still = np.zeros(len(t))
     draft, pitch, ratio = still, still, np.ones(share.shape)
     for _ in range(FIXED_POINT_ROUNDS):
-        of_front, of_rear = axle_loads(rig.chassis, draft, pitch, 0.0)
-        load = np.where(rear, of_rear, of_front) * share
+        load = wheel_loads(rig.chassis, rig.ahead, draft, pitch, 0.0) * share
         state = state._replace(entry_angle=entry_angle_for_load(load * ratio, state, model.model))
         carried, pull, torque = model.forces(state, rear, load)
         ratio = ratio * load / carried

@@ -143,6 +143,9 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
             "contradicted": decision.contradicted,
         },
         "gaps": dict(result.gaps),
+        "prediction_error": dict(result.prediction_error),
+        "standing": {name: value_std(estimate) for name, estimate in result.standing.items()},
+        "noise_factors": dict(result.noise_factors),
         "warning": {
             "state": str(result.watch.warning),
             "time_left": result.watch.time_left,

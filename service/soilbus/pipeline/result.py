@@ -34,7 +34,7 @@ def is_date(t: float) -> bool:
 
 
 class SoilChange(NamedTuple):
-    """Which soil a window is of (`tracker.TrackerState`), and why (`tracker.Reason`).
+    """Which soil a window is of (`soil_state.TrackerState`), and why (`soil_state.Reason`).
 
     The change statistic and its threshold are None without a change point.
     """
@@ -72,7 +72,14 @@ class WindowResult:
     failure
         Kind of failure of the solve; None for none.
     gaps
-        Reduced chi-square of channels that have not fitted for minutes, the worst first.
+        Channels that the model has predicted badly for minutes, with their `prediction_error`, the worst first.
+    prediction_error
+        By channel, how far off the model predicts new data, as a share of their size (`estimation.prediction`).
+    standing
+        Standing parts of the model (`estimation.standing`): relaxation length [m], inertia of a mean wheel [kg m^2],
+        lateness of channels beside torque and wheel speed [s].
+    noise_factors
+        By kind of sensor, its sd as the drive shows it over the configured one.
     channel_chi2
         Reduced chi-square of every channel over the last minutes.
     z_driven
@@ -116,6 +123,9 @@ class WindowResult:
     failure: str | None = None
     gaps: Mapping[str, float] = field(default_factory=dict)
     channel_chi2: Mapping[str, float] = field(default_factory=dict)
+    standing: Mapping[str, Estimate] = field(default_factory=dict)
+    noise_factors: Mapping[str, float] = field(default_factory=dict)
+    prediction_error: Mapping[str, float] = field(default_factory=dict)
     z_driven: tuple[float, float] | None = None
     search_ended: bool = False
     watch: Watch = Watch()  # noqa: RUF009, immutable

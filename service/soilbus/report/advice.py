@@ -38,7 +38,7 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
             return "the ground had just changed: nothing to do but drive on"
         case "not_excited" if names == ["few_bins"]:
             return "a window holds too few values for a soil: set a shorter estimator.bin or a longer estimator.window"
-        case "not_excited" | "ambiguous":
+        case "not_excited":
             return _vary(windows, valid)
         case "standstill":
             return "the vehicle stood or crept, or slipped beyond traversability.max_slip: drive on, with less pull"
@@ -57,14 +57,23 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
         case "implausible":
             return f"{what} contradicts the other sensors: check mounting, sign, scale and wiring"
         case "model_mismatch":
-            chi2 = [w.chi2 for w in windows if w.chi2 is not None and np.isfinite(w.chi2)]
-            off = f"the model is {np.sqrt(np.median(chi2)):.2g} times the noise off: " if chi2 else ""
+            off = _mispredicted(windows)
             if what:
                 off += f"{what} is mapped for several wheels: if it is the cell of one, map it for that one alone; or "
             return f"{off}check mass, radii, gear ratios, signs and slope; else {DIAGNOSE}"
         case "no_convergence":
             return f"no soil explains these data ({_moved(windows)}): check signs and scales; else {DIAGNOSE}"
     return None
+
+
+def _mispredicted(windows: Sequence[WindowResult]) -> str:
+    """Return how far off the model predicts its worst channel, in the median of the windows."""
+    channels = sorted({name for w in windows for name in w.prediction_error})
+    shares = {c: float(np.median([w.prediction_error.get(c, 0.0) for w in windows])) for c in channels}
+    if not shares:
+        return ""
+    worst = max(shares, key=shares.__getitem__)
+    return f"the model predicts {worst} {100.0 * shares[worst]:.0f} % off: "
 
 
 def _vary(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str:

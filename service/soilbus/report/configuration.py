@@ -19,7 +19,7 @@ from soilbus.can.dbc_files import checked_messages, load_databases, output_datab
 from soilbus.can.logs import Log
 from soilbus.can.mapping import AXLE_ROLES, SHARED_ROLES, WHEEL_ROLES, channels_of, without_unit
 from soilbus.config.model import Config, Form, Signal, Table
-from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, effects_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
 from soilbus.estimation.window import VEHICLE_QUANTITIES, NoiseTable, made_window
 from soilbus.offline.columns import SignalTable
@@ -313,11 +313,14 @@ def _expected(config: Config) -> tuple[float, float] | None:
 
 def effect_lines(config: Config) -> list[str]:
     """A line for each effect: which of its parameters are estimated and which held, or why it does not count."""
+    from soilbus.terra.effects.sensors import lateness  # not needed at a start without effects
+
     effects, free = effects_and_parameters_of(config)
     lines = []
-    for effect, _ in effects_of(config):
-        if effect.name == "channel_lag":
-            late = ", ".join(f"{quantity} {delay:.3g} s" for quantity, delay in delays_of(config).items())
+    for active in effects_of(config):
+        effect = active.effect
+        if effect.late:
+            late = ", ".join(f"{quantity} {delay:.3g} s" for quantity, delay in lateness([active]).items())
             lines.append(f"{effect.name}: taken out of the samples' stamps: {late}")
             continue
         if effect not in effects:

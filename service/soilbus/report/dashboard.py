@@ -114,7 +114,7 @@ class Vehicle:
     wheels
         Names in the order of the frames; empty where no configuration names them.
     axles
-        Axle of each of these wheels.
+        Of each of these wheels `Front`, or `Rear` behind the first axle, as in the names of signals.
     window
         Length of an estimation window [s].
     max_slip
@@ -134,7 +134,8 @@ class Vehicle:
         """Of a configuration; without names where the configuration is not that of the vehicle that is watched."""
         wheels = config.wheel if names_wheels else []
         return cls(
-            tuple(w.name for w in wheels), tuple(w.axle for w in wheels),
+            tuple(w.name for w in wheels),
+            tuple(w.axle and ("Front" if config.axles[w.axle] == 1.0 else "Rear") for w in wheels),
             config.estimator.window, config.traversability.max_slip, config.traversability.go,
         )  # fmt: skip
 
@@ -325,7 +326,7 @@ class Dashboard:
         """Slip for efficiency and for pull, while the frame may be acted on."""
         if not self.known.is_valid("TractionAdvice"):
             return None, None
-        axles = ("Front", "Rear") if axle is None else (axle.capitalize(),)
+        axles = ("Front", "Rear") if axle is None else (axle,)
         of_kind = (
             [self.known.number("TractionAdvice", f"SlipFor{kind}{name}") for name in axles]
             for kind in ("Efficiency", "Pull")

@@ -28,6 +28,7 @@ from soilbus.can.role_matching import (
     Assignment,
     Candidate,
     Slot,
+    axles_of,
     described,
     dimensions_of,
     is_word_in,
@@ -70,11 +71,11 @@ class _Draft:
     document: TOMLDocument = field(default_factory=tomlkit.document)
     used: set[str] = field(default_factory=set)
     named: set[str] = field(default_factory=set)
-    axles: tuple[str, ...] = ()
     open: int = 0
 
     def __post_init__(self) -> None:
         self._here: TOMLDocument | Table = self.document
+        self.axles = axles_of(self.assignment)
 
     def put(self, key: str, value: Any, comment: str = "") -> None:
         """A key of the section, with a comment beside it."""
@@ -156,7 +157,7 @@ def _open_values(value: Any) -> int:
 def proposal(
     database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str, time: str = ""
 ) -> Proposal:
-    """A configuration of four wheels from what was matched.
+    """A configuration of four wheels, or of those of more axles, from what was matched.
 
     Parameters
     ----------
@@ -188,11 +189,11 @@ def proposal(
             draft.put("time", time)
     _put_vehicle(draft)
     layout = _layout_of(draft)
-    draft.axles = layout.axles
     for axle in layout.axles:
         _put_axle(draft, axle)
-    for wheel in WHEELS:
-        _put_wheel(draft, wheel, layout)
+    for axle, wheels in draft.axles.items():
+        for wheel in wheels:
+            _put_wheel(draft, wheel, axle, layout)
     _put_signals(draft)
     _put_rest(draft)
     return Proposal(toml_text(draft.document), len(draft.used), draft.open)
@@ -212,7 +213,7 @@ class _Layout(NamedTuple):
 def _one_layout(assignment: Assignment) -> Assignment:
     """Torques of wheels and of axles, or of both axles and of one, are different machines: open unless one is left."""
     places = {slot.place for slot in assignment.asserted if slot.role == "torque"}
-    kinds = [places & set(WHEELS), places & {"front", "rear"}, places & {"both"}, places & {""}]
+    kinds = [places & WHEELS, places & set(AXLES) - {"both"}, places & {"both"}, places & {""}]
     if sum(map(bool, kinds)) <= 1:
         return assignment
     asserted, left = dict(assignment.asserted), dict(assignment.open)
@@ -230,17 +231,18 @@ def _layout_of(draft: _Draft) -> _Layout:
         if own.keys() <= {"", *AXLES} and all(len(cs) == 1 for cs in own.values()):
             at = set(own)
     loads = {place for role, place in asserted if role == "load" and place in AXLES}
-    if all(draft.matched("load", wheel) for wheel in WHEELS):
+    if all(draft.matched("load", wheel) for wheels in draft.axles.values() for wheel in wheels):
         loads = set()  # one measurement, not two
     driven = at & set(AXLES)
-    axles = [axle for axle in AXLES if axle in driven | loads]
+    named = set(draft.axles) if len(draft.axles) > 2 else set()
+    axles = [axle for axle in AXLES if axle in driven | loads | named]
     if "" in at:
         if draft.facts.axle:
             driven = {draft.facts.axle}
-            axles = [axle for axle in AXLES if axle in driven | loads]
+            axles = [axle for axle in AXLES if axle in driven | loads | named]
         else:
             axles.append("")
-    return _Layout(tuple(axles), frozenset(at & set(WHEELS)), frozenset(driven))
+    return _Layout(tuple(axles), frozenset(at & WHEELS), frozenset(driven))
 
 
 # --- sections ---
@@ -250,8 +252,12 @@ def _put_vehicle(draft: _Draft) -> None:
     draft.section("vehicle")
     mass = f"; the loads sum to {draft.facts.mass:.0f} kg in the log" if math.isfinite(draft.facts.mass) else ""
     draft.put_open("mass", f"kg with ballast, tank and driver{mass}")
-    draft.put_open("wheelbase", "m, front to rear axle")
-    draft.put_open("cg_ahead_of_rear_axle", "m, centre of gravity: wheelbase * load of the front axle / weight")
+    if len(draft.axles) == 2:
+        ends, share = "front to rear axle", "wheelbase * load of the front axle / weight"
+    else:
+        ends, share = "first to last axle", "sum of each axle's load * its distance to the last one / weight"
+    draft.put_open("wheelbase", f"m, {ends}")
+    draft.put_open("cg_ahead_of_rear_axle", f"m, centre of gravity: {share}")
     draft.put_open("cg_height", "m, centre of gravity above the ground")
     if draft.matched("draft"):
         draft.put_open("hitch_height", "m, line of draft above the ground")
@@ -269,7 +275,10 @@ def _put_axle(draft: _Draft, axle: str) -> None:
     if axle:
         draft.put("name", axle)
     else:
-        draft.put_open("name", 'axle that this motor drives: "front", "rear" or "both"')
+        names = ", ".join(f'"{name}"' for name in draft.axles)
+        draft.put_open("name", f'axle that this motor drives: {names} or "both"')
+    if axle in [*draft.axles][1:-1]:
+        draft.note("ahead_of_rear_axle = 1.0  # m, to the last axle; without, all axles are equally far apart")
     if axle == "" or (axle == draft.facts.axle and not draft.matched("torque", axle)):
         place = ""  # the motor of no name
         if axle:
@@ -291,8 +300,7 @@ def _put_axle(draft: _Draft, axle: str) -> None:
         draft.put_signal("load", load)
 
 
-def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
-    axle = "front" if wheel.startswith("F") else "rear"
+def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
     draft.section("wheel", repeated=True)
     draft.put("name", wheel)
     draft.put("axle", axle)
@@ -388,7 +396,8 @@ def _put_signals(draft: _Draft) -> None:
 
 def _put_rest(draft: _Draft) -> None:
     """Limits without load cells, noise, and candidates that no line names."""
-    if not any(all(draft.matched("load", place) for place in places) for places in (WHEELS, AXLES[:2])):
+    wheels = [wheel for pair in draft.axles.values() for wheel in pair]
+    if not any(all(draft.matched("load", place) for place in places) for places in (wheels, draft.axles)):
         draft.section("estimator")
         draft.put(
             "max_bearing_std",

@@ -24,7 +24,7 @@ from soilbus.report.replay_pictures import (
     map_pictures,
     run_pictures,
 )
-from soilbus.report.windows import by_reason, why_of_no_use
+from soilbus.report.windows import by_reason, machine_line, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
@@ -103,6 +103,8 @@ def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
     if drafts:
         of_windows = f"; the windows’ mean draft was {_range(pulled, 'kN')}" if pulled else ""
         yield f"The largest possible draft was {_range(drafts, 'kN')}{of_windows}."
+    if machine := machine_line(results):
+        yield f"{machine[0].upper()}{machine[1:]}."
     warnings = [t for r in results for t in r.warnings.begun]
     if warnings:
         times = {1: "once", 2: "twice"}.get(len(warnings), f"{len(warnings)} times")

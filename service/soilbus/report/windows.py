@@ -79,6 +79,7 @@ def summary_of(
         bearing = np.median([r.bearing.value for r in good if r.bearing])
         std = np.median([r.bearing.std for r in good if r.bearing])
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
+    lines += [line for line in [machine_line(good)] if line]
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
     could_pull = [r for r in good if r.traversability.max_draft is not None]
@@ -94,6 +95,20 @@ def summary_of(
         lines.append(f"samples {used + refused.total()}: used {used}, refused {refused.total()}")
     lines.append("refused samples " + counted(refused))
     return text_of([*lines, *doubted])
+
+
+def machine_line(results: Sequence[WindowResult]) -> str | None:
+    """Return what the newest window with an estimate says of the machine itself, in one line."""
+    found = next((r.standing for r in reversed(of_use(results)) if r.standing), None)
+    if found is None:
+        return None
+    units = {"relaxation_length": "m", "wheel_inertia": "kg m^2"}
+    parts = [
+        (name.removeprefix("lateness.").replace("_", " ") + (" late by" if name.startswith("lateness.") else ""),
+         f"{of.value:.2g} +- {of.std:.2g} {units.get(name, 's')}")
+        for name, of in found.items()
+    ]  # fmt: skip
+    return "the machine, beside its torque: " + ", ".join(f"{name} {value}" for name, value in parts)
 
 
 def unused(results: Sequence[WindowResult]) -> int:

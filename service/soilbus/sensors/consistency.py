@@ -333,8 +333,7 @@ def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
     """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
     draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
     due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
-    reported = np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1)
-    return np.asarray(reported - due)
+    return np.asarray(window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1) - due)
 
 
 def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
@@ -403,12 +402,12 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
         return
     scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, lag // 2, options)
     wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
-    if not wrong.any():
-        return
-    factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
-    if _jumps(data):
+    if wrong.any() and _jumps(data):
         yield "ground_speed"
         return
+    if not lasts(wrong, data.sustained):
+        return
+    factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
     if not 1.0 - (1.0 - seen) / factor < -options.feigned_slip:
         yield "ground_speed"
     if not seen < -options.feigned_slip:
@@ -465,18 +464,23 @@ def _jumps(data: ConsistencyInput) -> bool:
 
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
-    """The draft, where the vehicle pulls less whenever its wheels drive more; needs slope and inertia."""
+    """The draft, where the vehicle is pushed, and the more so whenever its wheels drive more; needs slope and inertia.
+
+    On soft ground it may also pull less when its wheels drive more, for they sink; but it pulls.
+    """
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None:
         return
     lag, weight, variance = data.sustained, chassis.mass * GRAVITY, window.variance
-    driven = change((window.torque / rig.radius).sum(axis=1), lag)
+    thrust = (window.torque / rig.radius).sum(axis=1)
+    driven = change(thrust, lag)
     noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
     known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
-    pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
+    pulled = np.where(known & data.driving, pull_given(window, chassis), np.nan)
+    pull = change(pulled, lag)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
     pull_noise = np.sqrt(change_variance(of_pull, lag))
-    if _opposite(data, (driven, pull), (noise, pull_noise)):
+    if median(pulled * thrust) < 0.0 and _opposite(data, (driven, pull), (noise, pull_noise)):
         yield "draft"
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from soilbus.arrays import Array
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import check_decodable
-from soilbus.can.role_matching import ASSERTED, AXLES, WHEELS, Assignment, Candidate, Slot
+from soilbus.can.role_matching import ASSERTED, WHEELS, Assignment, Candidate, Slot, axles_of
 from soilbus.can.units import STANDARD_GRAVITY
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 
@@ -146,19 +146,21 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
     if moving.sum() < LEAST_BINS:
         moving = np.ones(len(ground), bool)
     forward = _one(np.sign(ground))
-    speed = {w: read("speed", w) for w in WHEELS}
-    speed["front"], speed["rear"] = ((speed[a] + speed[b]) / 2.0 for a, b in (("FL", "FR"), ("RL", "RR")))
-    cells = [[read("load", p) for p in places if Slot("load", p) in asserted] for places in (WHEELS, AXLES[:2])]
-    whole = [loads for loads, n in zip(cells, (4, 2), strict=True) if len(loads) == n]
+    axles = axles_of(assignment)
+    wheels = [wheel for pair in axles.values() for wheel in pair]
+    speed = {w: read("speed", w) for w in wheels}
+    speed |= {axle: (speed[left] + speed[right]) / 2.0 for axle, (left, right) in axles.items()}
+    cells = [places for places in (wheels, list(axles)) if all(Slot("load", p) in asserted for p in places)]
     facts = Facts(
         kind=_kind(read("acceleration"), ground, read("pitch")),
-        mass=_median(np.sum(whole[0], axis=0)) / STANDARD_GRAVITY if whole else math.nan,
-        axle=_driven_axle(read("motor_speed")[moving], speed["front"][moving], speed["rear"][moving]),
+        mass=_median(np.sum([read("load", p) for p in cells[0]], axis=0)) / STANDARD_GRAVITY if cells else math.nan,
+        axle=_driven_axle(read("motor_speed")[moving], {axle: speed[axle][moving] for axle in axles}),
     )
     for place, wheel in speed.items():
         own = "" if place == facts.axle else place
         motor = read("motor_speed", own if Slot("motor_speed", own) in asserted else place)
-        _gear(facts, assignment, place, motor[moving], wheel[moving])
+        first = axles[place][0] if place in axles else place
+        _gear(facts, assignment.asserted.get(Slot("speed", first)), place, motor[moving], wheel[moving])
         own_speed = asserted.get(Slot("speed", place))
         if own_speed is not None and own_speed.dimension == "rotation":
             turning = moving & (wheel != 0.0)
@@ -206,17 +208,16 @@ def _as_ground_speed(c: Candidate, recording: Recording, turning: Array) -> Cand
     return c
 
 
-def _gear(facts: Facts, assignment: Assignment, place: str, motor: Array, wheel: Array) -> None:
-    own = assignment.asserted.get(Slot("speed", place if place in WHEELS else {"front": "FL", "rear": "RL"}[place]))
+def _gear(facts: Facts, own: Candidate | None, place: str, motor: Array, wheel: Array) -> None:
     if own is not None and _scatter(motor, wheel) < 5.0 * RIGID:
         _keep(facts.gear_ratio if own.dimension == "rotation" else facts.per_metre, place, np.abs(motor / wheel))
 
 
 def _pool(ratios: dict[str, float]) -> None:
     """Gears of one kind on all wheels have one ratio: its median, free of each sensor's gain error."""
-    wheels = [ratios[place] for place in WHEELS if place in ratios]
-    if wheels and max(wheels) < (1.0 + SAME_GEAR) * min(wheels):
-        ratios.update({place: float(np.median(wheels)) for place in WHEELS if place in ratios})
+    wheels = {place: ratio for place, ratio in ratios.items() if place in WHEELS}
+    if wheels and max(wheels.values()) < (1.0 + SAME_GEAR) * min(wheels.values()):
+        ratios.update(dict.fromkeys(wheels, float(np.median([*wheels.values()]))))
 
 
 def _sign(facts: Facts, c: Candidate, value: Array) -> None:
@@ -243,10 +244,10 @@ def _kind(acceleration: Array, ground: Array, pitch: Array) -> str:
     return "specific_force" if k > 0.5 else "kinematic"
 
 
-def _driven_axle(motor: Array, front: Array, rear: Array) -> str:
-    """The axle that turns with a motor whose place no name says, where the other one does not."""
-    scatter = {"front": _scatter(motor, front), "rear": _scatter(motor, rear)}
-    near, far = sorted(scatter, key=lambda axle: scatter[axle])
+def _driven_axle(motor: Array, axles: Mapping[str, Array]) -> str:
+    """The axle that turns with a motor whose place no name says, where no other one does."""
+    scatter = {axle: _scatter(motor, speed) for axle, speed in axles.items()}
+    near, far, *_ = sorted(scatter, key=lambda axle: scatter[axle])
     return near if scatter[near] < RIGID and scatter[far] > 3.0 * scatter[near] else ""
 
 

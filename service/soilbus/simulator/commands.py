@@ -31,11 +31,11 @@ class Commands:
     Parameters
     ----------
     config
-        Names its wheels, FL, FR, RL and RR of the DBC in their order, with their gears.
+        Names its wheels with their gears: FL, FR, RL and RR of the DBC are the first two and the last two.
     """
 
     def __init__(self, config: Config) -> None:
-        self._wheels = config.wheel[:4]
+        self._wheels = [*config.wheel[:2], *config.wheel[2:][-2:]]
         database = Database()
         database.add_dbc_file(str(shipped_dbc("tractor.dbc")))
         self._messages = {m.frame_id: m for m in map(database.get_message_by_name, (_DRIVE, _TORQUE_LIMIT))}

@@ -43,7 +43,7 @@ from soilbus.simulator.equilibrium import (
 )
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, Wave, oscillation, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required
+from soilbus.terra.vehicle import GRAVITY, Chassis, pull_required, wheel_loads
 from soilbus.terra.wheel import WheelModel
 
 STEP = 0.1
@@ -256,8 +256,8 @@ def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, 
     spread = Swing(-scenario.slip_spread, scenario.slip_spread)
     deviation = np.stack([realise(spread, t, rng).value for _ in config.wheel])
     deviation = np.where((drivetrain.leader < 0)[:, None], 0.0, deviation[drivetrain.leader])
-    bounce = _bounce(config.wheel, scenario, t, seed)
-    rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
+    bounce = _bounce(config, scenario, t, seed)
+    rear = _ahead(config) < 1.0
     model = WheelModel(shear_law=config.model.shear_law, rollers=config.rollers)
     length = float(speed.integral[-1])
     mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, effects, climbs)
@@ -362,7 +362,7 @@ def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
     chassis, vehicle = chassis_of(config), config.vehicle
     if chassis is None or vehicle is None or not config.wheel:
         raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
-    if not chassis.on_tracks and {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
+    if not chassis.on_one_axle and len(config.axles) < 2:
         raise SimulationError("the simulator needs wheels on both axles")
     if not scenario.drawn_mass:
         return chassis
@@ -375,12 +375,13 @@ def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
     return replace(chassis, mass=chassis.mass + float(drawn[0]), cg_ahead_of_rear_axle=float(ahead))
 
 
-def _bounce(wheels: Sequence[Wheel], scenario: Scenario, t: Array, seed: int) -> Array:
+def _bounce(config: Config, scenario: Scenario, t: Array, seed: int) -> Array:
     """What bounce and roll of each axle add to the loads of its wheels (W, N), over these."""
+    wheels = config.wheel
     if not scenario.bounce:
         return np.zeros((len(wheels), len(t)))
     rng = np.random.default_rng([seed, _BOUNCE_STREAM])
-    modes = {axle: (oscillation(t, rng), oscillation(t, rng)) for axle in ("front", "rear")}
+    modes = {axle: (oscillation(t, rng), oscillation(t, rng)) for axle in config.axles}
     of_wheels = []
     for wheel in wheels:
         up, roll = modes[str(wheel.axle)]
@@ -424,19 +425,17 @@ def _situation(
     shape = (len(wheels), len(motion.t))
     share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))]) * (1.0 + plan.bounce[:, part])
 
+    ahead = _ahead(plan.config)
+
     def loads(draft: float, inertia: float = 0.0) -> Array:
-        front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration + inertia)
-        return np.asarray(share * np.stack([front if wheel.axle == "front" else rear for wheel in wheels]))
+        return np.asarray(share * wheel_loads(chassis, ahead, draft, motion.pitch, motion.acceleration + inertia))
 
     test_draft = chassis.mass  # any draft will do, loads are linear in it
     level = loads(0.0)
     drawn = loads(0.0, 1.0) if climbs else loads(test_draft)
-    static = axle_loads(chassis, 0.0, 0.0, 0.0)
-    upright = share * np.array([[static[wheel.axle != "front"]] for wheel in wheels]) * float(climbs)
-    ahead = {"front": chassis.wheelbase - chassis.cg_ahead_of_rear_axle, "rear": -chassis.cg_ahead_of_rear_axle}
-    if chassis.on_tracks:
-        ahead["front"] = 0.0
-    position = np.stack([motion.distance + ahead[str(wheel.axle)] for wheel in wheels])
+    upright = share * wheel_loads(chassis, ahead, 0.0, 0.0, 0.0)[:, None] * float(climbs)
+    to_cg = 0.0 * ahead if chassis.on_one_axle else ahead * chassis.wheelbase - chassis.cg_ahead_of_rear_axle
+    position = motion.distance + to_cg[:, None]
     soil = soil_along(plan.scenario.soils, position, plan.scenario.transition)
 
     def each_wheel(values: list[float]) -> Array:
@@ -473,10 +472,15 @@ def _situation(
 
 
 def _load_share(wheels: list[Wheel], index: int, side: Array) -> Array:
-    """Share (N,) of its axle's load on one wheel; wheels of an axle are listed left to right."""
+    """What a side slope makes (N,) of one wheel's load, over it; wheels of an axle are listed left to right."""
     mates = [i for i, wheel in enumerate(wheels) if wheel.axle == wheels[index].axle]
     place = np.linspace(1.0, -1.0, len(mates))[mates.index(index)] if len(mates) > 1 else 0.0
-    return np.asarray((1.0 + place * side) / len(mates))
+    return np.asarray(1.0 + place * side)
+
+
+def _ahead(config: Config) -> Array:
+    """How far each wheel (W,) is ahead of the last axle, over the wheelbase."""
+    return np.array([config.axles[str(wheel.axle)] for wheel in config.wheel])
 
 
 def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:

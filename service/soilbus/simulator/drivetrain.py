@@ -137,14 +137,14 @@ def _wheels_of(axle: Axle, wheels: Sequence[Wheel]) -> list[int]:
 def _couplings(config: Config, group: Sequence[int]) -> Iterator[tuple[list[int], list[int], float]]:
     """The two sides of each differential behind a motor, and its bias: one less than the motor has wheels."""
     on_one_signal = [{config.wheel.index(wheel) for wheel in same} for same in config.same_signal("speed")]
-    on_axle = {name: [i for i in group if config.wheel[i].axle == name] for name in ("front", "rear")}
+    on_axle = {name: [i for i in group if config.wheel[i].axle == name] for name in config.axles}
     for name, wheels in on_axle.items():
         for one, other in pairwise(wheels):
             rigid = any({one, other} <= same for same in on_one_signal)
             yield [one], [other], math.inf if rigid else _bias(config.axle_named(name), "open")
-    if all(on_axle.values()):
-        rigid = any(set(group) <= same for same in on_one_signal)
-        yield on_axle["front"], on_axle["rear"], math.inf if rigid else _bias(config.axle_named("both"), "locked")
+    rigid = any(set(group) <= same for same in on_one_signal)
+    for front, rear in pairwise(filter(None, on_axle.values())):
+        yield front, rear, math.inf if rigid else _bias(config.axle_named("both"), "locked")
 
 
 def _bias(axle: Axle | None, otherwise: str) -> float:

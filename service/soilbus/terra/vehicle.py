@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["GRAVITY", "Chassis", "axle_loads", "pull_required", "slip_ratio"]
+__all__ = ["GRAVITY", "Chassis", "axle_loads", "pull_required", "slip_ratio", "wheel_loads", "wheel_shares"]
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
@@ -19,9 +19,9 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class Chassis:
-    """Mass [kg] and lengths [m] of a two-axle vehicle; heights above the ground.
+    """Mass [kg] and lengths [m] of a vehicle, wheelbase from its first to its last axle; heights above the ground.
 
-    on_tracks: the tracks of its front carry all of it, wherever the load acts (uniform pressure).
+    on_one_axle: its tracks, or the wheels of a single axle, carry all of it, wherever the load acts.
     """
 
     mass: float
@@ -29,7 +29,7 @@ class Chassis:
     cg_ahead_of_rear_axle: float
     cg_height: float
     hitch_height: float
-    on_tracks: bool = False
+    on_one_axle: bool = False
 
     @property
     def in_reverse(self) -> Chassis:
@@ -75,13 +75,44 @@ def pull_required(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -
 
 
 def axle_loads(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> tuple[Any, Any]:
-    """Load [N] on the front and on the rear axle, from moments about the rear contact."""
+    """Load [N] on the front and on the rear axle, from moments about the rear contact.
+
+    An axle between them counts on both, by how near it is: a load W at x ahead of the rear axle is W x / wheelbase on
+    the front axle and the rest on the rear one (`wheel_shares`).
+    """
     weight = chassis.mass * GRAVITY
     along = weight * np.sin(pitch) + chassis.mass * acceleration
     across = weight * np.cos(pitch)
-    if chassis.on_tracks:
+    if chassis.on_one_axle:
         front = across + 0.0 * (along + draft)
         return front, 0.0 * front
     moment = across * chassis.cg_ahead_of_rear_axle - along * chassis.cg_height - draft * chassis.hitch_height
     front = moment / chassis.wheelbase
     return front, across - front
+
+
+def wheel_shares(ahead: Any) -> Any:
+    """Shares (W, 2) of the loads of `axle_loads` that each wheel carries, left and right alike.
+
+    With more than two axles these loads are statically indeterminate.  A rigid frame on equally stiff wheels makes them
+    linear along the wheelbase: of all loads in balance those with the least sum of squares.
+
+    Parameters
+    ----------
+    ahead
+        (W,), distance of each wheel ahead of the rear axle, over the wheelbase.
+
+    Examples
+    --------
+    >>> wheel_shares([1.0, 0.5, 0.0]).round(3).tolist()
+    [[0.833, -0.167], [0.333, 0.333], [-0.167, 0.833]]
+    """
+    ends = np.stack([ahead, 1.0 - np.asarray(ahead)])
+    return ends.T @ np.linalg.pinv(ends @ ends.T)
+
+
+def wheel_loads(chassis: Chassis, ahead: Any, draft: Any, pitch: Any, acceleration: Any) -> Any:
+    """Load [N] (W, ...) on each wheel, `ahead` as in `wheel_shares`, left and right alike."""
+    front, rear = axle_loads(chassis, draft, pitch, acceleration)
+    of_front, of_rear = wheel_shares(ahead).T
+    return np.multiply.outer(of_front, front) + np.multiply.outer(of_rear, rear)

@@ -23,7 +23,7 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.terra.vehicle import axle_loads
+from soilbus.terra.vehicle import wheel_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.trials.draws import Each, drawn_soil, first_drive, prior_about, seeds_of, with_prior
 from soilbus.trials.windows import first_window, torque_limits
@@ -128,10 +128,10 @@ def true_largest_draft(
         raise ValueError("a draft needs the vehicle's mass and geometry")
     slips = max_slip * SLIP_SHARES
     shape = (len(rig.radius), len(slips))
-    share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
+    share = np.ones(len(rig.radius))
     left, right = pairs(rig)
-    share[left], share[right] = share[left] * (1.0 + side_shift), share[right] * (1.0 - side_shift)
-    free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))
+    share[left], share[right] = 1.0 + side_shift, 1.0 - side_shift
+    free, drawn = (wheel_loads(rig.chassis, rig.ahead, draft, 0.0, 0.0) * share for draft in (0.0, 1.0))
     none = np.zeros(len(slips))
     limit = np.where(np.isfinite(torque_limit), torque_limit, np.inf)
     drivetrain = own_motors(limit) if drivetrain is None else drivetrain

@@ -15,6 +15,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, Window, forward
 from soilbus.pipeline.intake import ReportedLimits, WindowTask
@@ -31,10 +32,12 @@ def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
     return bins
 
 
-def observed(config: Config, channels: Mapping[str, Column], duration: float) -> ObservationModel:
+def observed(
+    config: Config, channels: Mapping[str, Column], duration: float, options: EstimatorOptions = ESTIMATOR
+) -> ObservationModel:
     """The first `duration` [s] of the channels as one window to be fitted, without effects."""
     window = bins_of(config, channels).window(0.0, duration)
-    return ObservationModel(window, rig_of(config), model_of(config), config.estimator.min_speed)
+    return ObservationModel(window, rig_of(config, options), model_of(config), config.estimator.min_speed)
 
 
 def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.observation_model import Linearisation, ObservationModel
+from soilbus.estimation.options import ESTIMATOR, HELD, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig
 from soilbus.simulator.recording import simulate
@@ -85,13 +86,17 @@ def assumed_of(soil: Soil, rng: np.random.Generator) -> Soil:
     return Soil(*(np.asarray(soil) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
 
 
+AS_PEERS = replace(ESTIMATOR, standing=HELD, search=replace(ESTIMATOR.search, cold=SolverOptions()))
+"""The peers know no relaxation, inertia and lateness, and go on to the end of a descent."""
+
+
 def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
     """10 s of the full simulator, slip swept between 0.05 and 0.4, bins of 0.1 s."""
     config = reference_configuration()
     quiet = config.model_copy(update={"noise": config.noise.scaled(0.0)}) if noise_free else config
     scenario = Scenario(LENGTH, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
     recording = simulate(quiet, scenario, seed)
-    problem = observed(config, recording.channels, LENGTH)
+    problem = observed(config, recording.channels, LENGTH, AS_PEERS)
     return Case(soil, assumed_of(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
 
 

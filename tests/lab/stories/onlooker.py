@@ -120,9 +120,9 @@ class MadePipeline(Pipeline):
 class NotingTracker(Tracker):
     """A tracker that adds its results to `found`."""
 
-    def __init__(self, found: list[TrackerOutput], *args: Any) -> None:
+    def __init__(self, found: list[TrackerOutput], *args: Any, **named: Any) -> None:
         self.found = found
-        super().__init__(*args)
+        super().__init__(*args, **named)
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         self.found.append(super().estimate(window, end))
@@ -141,7 +141,7 @@ def good_tracked(config: Config = CONFIG) -> TrackerOutput:
     config = config.model_copy(update={"estimator": reference_configuration().estimator.model_copy(update=limits)})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
-    messages = drive_messages(config, 20.0)
+    messages = drive_messages(config, 40.0)  # the rear-driven one knows its largest draft after half a minute
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
@@ -152,9 +152,8 @@ def of_soft_ground(tracked: TrackerOutput) -> TrackerOutput:
     """The same, as sure of it, of a ground that holds nothing."""
     soft = np.array(SOILS["wet_clay"]) * [0.05, 0.05, 1.0, 0.3, 0.2, 1.0]
     fit = fit_of(tracked)
-    gaussian = dataclasses.replace(fit.reported, soil=soft)
     return dataclasses.replace(
-        tracked, fit=dataclasses.replace(fit, mode=gaussian, marginalised=None, second_mode=None)
+        tracked, fit=dataclasses.replace(fit, mode=dataclasses.replace(fit.mode, soil=soft), form=None)
     )
 
 
@@ -390,10 +389,10 @@ NO_WINDOW = Handed(-1, -math.inf, NOTHING, True)
 class TrueTracker(Tracker):
     """A tracker that says of each window what a drive knows to be true, and shows the drive what it recalls."""
 
-    def __init__(self, drive: Drive, *args: Any) -> None:
+    def __init__(self, drive: Drive, *args: Any, **named: Any) -> None:
         self.drive = drive
         self.said: Gaussian | None = None
-        super().__init__(*args)
+        super().__init__(*args, **named)
 
     @property
     def newest_posterior(self) -> Gaussian | None:
@@ -408,7 +407,7 @@ class TrueTracker(Tracker):
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         tracked = self.drive.truth(window, end)
-        self.said = fit_of(tracked).reported
+        self.said = fit_of(tracked).mode
         return tracked
 
 
@@ -471,7 +470,7 @@ class Drive:
             raise ZeroDivisionError
         tracked = self.of_soft if known.soft else self.tracked
         assert tracked is not None
-        return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
+        return tracked_at(tracked, window, since=end - (0.0 if known.blind else self.config.estimator.window))
 
     def open(self) -> Wire:
         if self.wire.lost:

@@ -9,6 +9,7 @@ Both start at the prior's median; ours then also tries other soils.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import Fit, fit_window
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
+from soilbus.estimation.options import ESTIMATOR, HELD
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -45,6 +47,8 @@ Each pass has the weights and the eliminated loads and speeds of the end of the 
 the last would be wasted. Four passes are the least that bring all six windows to the same end as ours."""
 RELATIVE_DIFFERENCE = 1e-5
 """Relative step of the finite differences. The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
+AT_REST = replace(ESTIMATOR, standing=HELD)
+"""The peer knows no relaxation, inertia and lateness."""
 
 
 class Window(NamedTuple):
@@ -128,6 +132,7 @@ def _whitened(
     `latents`, into every residual.
     """
     rig, W, scale = problem.rig, problem.n_wheels, 1.0 / (1.0 + frozen)
+    draft_gain = 3 * W + 1  # after those of torques, loads, speeds and ground speed
     own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
     covariance = at.by_latents * at.variance[:, None] @ at.by_latents.swapaxes(1, 2)
     np.einsum("nww->nw", covariance)[:] += own
@@ -145,10 +150,10 @@ def _whitened(
         draft = pull.sum(1) - (problem.demand - problem.draft)
         misfit = [
             (problem.torque - (1.0 + gains[:W]) * torque) * scale[:W],
-            ((problem.draft - (1.0 + gains[-1]) * draft) * scale[-1])[:, None],
+            ((problem.draft - (1.0 + gains[draft_gain]) * draft) * scale[draft_gain])[:, None],
             problem.sinkage - sinkage(angle, rig.radius),
         ]
-        linear = at.by_latents @ ((measured - (1.0 + gains[W:-1]) * now) * scale[W:-1])[:, :, None]
+        linear = at.by_latents @ ((measured - (1.0 + gains[W:draft_gain]) * now) * scale[W:draft_gain])[:, :, None]
         return np.asarray((whiten @ (np.concatenate(misfit, axis=1)[:, :, None] + linear)).ravel())
 
     return residuals
@@ -164,4 +169,4 @@ def window_of(name: str, exact: str, rough: str) -> Window:
         *(f"noise.{quantity}.gain=0" for quantity in ("torque", "load", "speed", "ground_speed", "draft")),
     ])  # fmt: skip
     channels = simulate(config, excited(name, WINDOW_LENGTH), seed=1).channels
-    return Window(observed(config, channels, WINDOW_LENGTH), prior_of(config))
+    return Window(observed(config, channels, WINDOW_LENGTH, AT_REST), prior_of(config))

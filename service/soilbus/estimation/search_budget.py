@@ -1,0 +1,62 @@
+"""How many evaluations of the model a search for another soil may take."""
+
+from __future__ import annotations
+
+from soilbus.estimation.observation_model import Work
+
+__all__ = ["SearchBudget"]
+
+
+class SearchBudget:
+    """Token bucket of model evaluations for searches, counted in whole windows, so that a replay is reproducible.
+
+    Parameters
+    ----------
+    rate : float
+        Evaluations that each window adds.
+    burst : float
+        Most evaluations that are kept for later.
+
+    Notes
+    -----
+    A window that follows another needs a few evaluations.  At a start, a border or after a gap
+    a search from many soils is due, and soon succeeds.  Where the model does not describe the
+    data no search succeeds, window after window; the empty bucket then limits the cost.
+
+    References
+    ----------
+    Turner 1986, IEEE Communications 24(10):8.
+
+    Examples
+    --------
+    >>> budget = SearchBudget(rate=4.0, burst=10.0)
+    >>> budget.next_window(instants=200)
+    >>> budget.allows()
+    True
+    >>> before = budget.work.instants
+    >>> budget.work.instants += 2000  # ten evaluations of the window
+    >>> budget.spend(before)
+    >>> budget.allows()
+    False
+    """
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self.work = Work()
+        self._rate, self._burst = rate, burst
+        self._remaining, self._window = burst, 1
+        self.ended = False
+
+    def next_window(self, instants: int, refill: bool = False) -> None:
+        """A window of N instants begins; refill: the model described recent data, so the bucket is filled."""
+        self._remaining = self._burst if refill else min(self._remaining + self._rate, self._burst)
+        self._window = max(instants, 1)
+        self.ended = False
+
+    def allows(self) -> bool:
+        """Whether evaluations remain for a search; if not, `ended` is set."""
+        self.ended = self.ended or self._remaining <= 0.0
+        return self._remaining > 0.0
+
+    def spend(self, work_before: int) -> None:
+        """Take the evaluations since `work_before` [instants] from the bucket, which one search may overdraw."""
+        self._remaining -= (self.work.instants - work_before) / self._window

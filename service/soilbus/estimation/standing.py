@@ -1,0 +1,84 @@
+"""Standing parts of every model: what a machine in motion adds to steady wheel forces, and how late its sensors are.
+
+    slip       s + (L / V) ds/dt = 1 - V / (r omega)             relaxation length L of tyre and soil
+    torque     T = T_soil + J domega/dt                          inertia J of a wheel
+    channel    y(t) = x(t - d),   x = y + d dy/dt                d: lateness beside torque and wheel speed
+
+Each is linear in its parameter to first order, about none of it: one more gain, with a prior of mean 0 and
+a column of the Jacobian.  Its posterior goes on from window to window.  L / V and d are short beside a second.
+
+References
+----------
+Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness: Ljung, System Identification (1999).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.estimation.options import StandingOptions
+from soilbus.estimation.window import Rig, Window
+
+__all__ = ["STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
+
+STANDING = (
+    "relaxation_length", "wheel_inertia", "lateness.load", "lateness.ground_speed", "lateness.draft",
+    "lateness.acceleration",
+)  # fmt: skip
+"""Names of the parameters, in order: [m], [1: in `wheel_inertia` units], [s]."""
+
+
+class StandingColumns(NamedTuple):
+    """Derivatives by the parameters of STANDING (S): torques (N, W, S), demand (N, S), latents (N, 2 W + 1, S)."""
+
+    torque: Array
+    demand: Array
+    latents: Array
+
+
+def standing_std(rig: Rig) -> list[float]:
+    """Return the prior sd of each of STANDING; 0, held, for a test rig, whose rows are no motion."""
+    options: StandingOptions = rig.options.standing
+    if rig.chassis is None:
+        return [0.0] * len(STANDING)
+    return [options.relaxation_length, options.wheel_inertia, options.load, options.ground_speed, options.draft,
+            options.acceleration]  # fmt: skip
+
+
+def wheel_inertia(rig: Rig) -> Array:
+    """Return the usual inertia (W,) [kg m^2] of each wheel: a disc of 3 % of the vehicle's mass."""
+    mass = 0.0 if rig.chassis is None else rig.chassis.mass
+    return np.asarray(rig.options.standing.wheel_mass_share * mass * rig.radius**2 / 2.0)
+
+
+def standing_columns(window: Window, rig: Rig) -> StandingColumns:
+    """Return the derivatives by STANDING at every bin of a completed window; 0 where a slope is not known."""
+    N, W, S = len(window.t), len(rig.wheels), len(STANDING)
+    columns = StandingColumns(np.zeros((N, W, S)), np.zeros((N, S)), np.zeros((N, 2 * W + 1, S)))
+    if N < 3 or rig.chassis is None:
+        return columns
+    t, ground = window.t, window.ground_speed[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slip = 1.0 - ground / (rig.radius * window.speed)
+        relaxed = -_slope(t, slip) / ground * (rig.radius * window.speed**2 / ground)
+    columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
+    columns.torque[:, :, 1] = -wheel_inertia(rig) * _slope(t, window.speed)
+    columns.latents[:, :W, 2] = _slope(t, window.load) if _measures_loads(rig) else 0.0
+    columns.latents[:, 2 * W, 3] = _slope(t, ground)[:, 0]
+    columns.demand[:, 4] = _slope(t, window.draft[:, None])[:, 0]
+    columns.demand[:, 5] = rig.chassis.mass * _slope(t, window.acceleration[:, None])[:, 0]
+    return columns
+
+
+def _measures_loads(rig: Rig) -> bool:
+    given = rig.instrumentation
+    return given is None or all(row.kind == "channel" for row in given.load)
+
+
+def _slope(t: Array, values: Array) -> Array:
+    """Return slopes (N, C) of values (N, C) over times t (N,) [s]; 0 where a neighbour is unknown."""
+    slope = np.gradient(values, t, axis=0)
+    return np.where(np.isfinite(slope), slope, 0.0)

@@ -1,0 +1,128 @@
+"""Variance components: what each kind of sensor is worth, from the residuals of earlier windows.
+
+With e = S^-1 r the weighed residuals of an instant and A their derivatives by the latents, a sensor of variance V has
+
+    correction   v = V A' e    (of a row: v = R e)
+    share        V A' S^-1 A   (of a row: R S^-1)         of its own noise that the corrections show
+    factor       f = sum over blocks of (sum of v / sqrt V)^2  /  sum of shares           blocks of one second
+
+so that f V is the variance that corrections of this kind have in the mean over a second (Foerstner 1979, Allg. Verm.
+Nachr. 86:446; blocks: Newey & West 1987, Econometrica 55:703).  Errors that follow each other, of the model or of a
+machine that shakes, so have the weight of few independent ones.  The factor is never less than that of single
+instants: noise that averages out within a second is still in each instant's loads and speeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.estimation.instrumentation import Row
+from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, Optimum
+from soilbus.estimation.options import VarianceOptions
+from soilbus.estimation.window import Rig, Window
+
+KINDS = {
+    "torque": ("torque",), "draft": ("draft", "pitch", "acceleration"), "sinkage": ("sinkage",),
+    "load": ("load",), "speed": ("speed",), "ground_speed": ("ground_speed",), "computed_load": (),
+}  # fmt: skip
+"""Quantities whose variance each factor scales; that of loads which no cell measures is of the rig."""
+
+
+@dataclass(frozen=True, slots=True)
+class VarianceComponents:
+    """Factors on the sensors' variances by kind, learned from `weight` windows.
+
+    Attributes
+    ----------
+    factor : Mapping of str to float
+        Of the kinds seen so far; 1 of every other.
+    weight : float
+        Windows that the factors rest on.
+    """
+
+    options: VarianceOptions
+    factor: Mapping[str, float] = field(default_factory=dict)
+    weight: float = 0.0
+
+    def scaled(self, window: Window, rig: Rig) -> Window:
+        """Return the window with the variances of sensors, and of loads that none measures, times their factors."""
+        variance = dict(window.variance)
+        for kind, factor in self.factor.items():
+            for quantity in KINDS[kind]:
+                variance[quantity] = factor * variance[quantity]
+        given, observations = rig.instrumentation, window.observations
+        if given is not None and observations is not None:
+            torque = [self._of_row(row, "torque", "") for row in given.torque]
+            load = [self._of_row(row, "load", "computed_load") for row in given.load]
+            speed = [self._of_row(row, "speed", "") for row in given.speed]
+            latents = np.array([*load, *speed, self.factor.get("ground_speed", 1.0)])
+            observations = observations._replace(
+                torque_var=observations.torque_var * torque, variance=observations.variance * latents
+            )
+        return replace(window, variance=variance, observations=observations)
+
+    def _of_row(self, row: Row, measured: str, computed: str) -> float:
+        return self.factor.get(measured if row.kind == "channel" else computed, 1.0)
+
+    def after(self, found: Mapping[str, float], whole: bool = False) -> VarianceComponents:
+        """Return the components after a window whose corrections are `found` times those expected; whole: replaced."""
+        share = 1.0 if whole else 1.0 / (min(self.weight, self.options.memory) + 1.0)
+        factor = dict(self.factor)
+        for kind, ratio in found.items():
+            old = factor.get(kind, 1.0)
+            factor[kind] = min(max(old * ratio**share, self.options.least), self.options.most)
+        return replace(self, factor=factor, weight=self.weight + 1.0)
+
+
+def correction_ratios(problem: ObservationModel, optimum: Optimum, options: VarianceOptions) -> dict[str, float]:
+    """Return the factor of each kind of sensor by which its corrections exceed what its variance says.
+
+    Parameters
+    ----------
+    problem : ObservationModel
+        The fitted window.
+    optimum : Optimum
+        Its fit.
+    options : VarianceOptions
+        Length of a block.
+    """
+    A, (N, m) = optimum.at.by_latents, optimum.at.by_latents.shape[:2]
+    e = optimum.at.weighed[:, RESIDUAL].reshape(N, m)
+    variance, row_var = problem.variances(optimum.gains)
+    inverse = problem.inverse_covariance(A, variance, row_var)
+    by_latents = np.einsum("nml,nm->nl", A, e)
+    shares = variance * np.einsum("nml,nmk,nkl->nl", A, inverse, A, optimize=True)
+    of_rows = row_var * np.einsum("nmm->nm", inverse)
+    layout, known = problem.layout, problem.known
+    known = known & problem.measured_rows
+    rows = np.where(known, np.sqrt(row_var) * e, 0.0), np.where(known, of_rows, 0.0)
+    corrections, measured = np.sqrt(variance) * by_latents, problem.measured_latents
+    if problem.rig.lengths is not None:  # a track's load is the mean of a window, and single instants do not show it
+        shares[:, layout.loads] = np.where(problem.rig.lengths > 0.0, 0.0, shares[:, layout.loads])
+    latents = corrections, np.where(measured, shares, 0.0)
+    computed = corrections, np.where(measured, 0.0, shares)
+    found = {}
+    for kind, (values, expected), columns in (
+        ("torque", rows, layout.torques),
+        ("draft", rows, slice(layout.balance, layout.balance + 1)),
+        ("sinkage", rows, layout.sinkages),
+        ("load", latents, layout.loads),
+        ("computed_load", computed, layout.loads),
+        ("speed", latents, layout.speeds),
+        ("ground_speed", latents, slice(layout.ground_speed, layout.ground_speed + 1)),
+    ):
+        total = float(expected[:, columns].sum())
+        if total > options.least_share * N:
+            value = np.where(expected[:, columns] > 0.0, values[:, columns], 0.0)
+            found[kind] = max(float((s**2).sum()) for s in (value, block_sums(value, problem.t, options.block))) / total
+    return found
+
+
+def block_sums(values: Array, t: Array, block: float) -> Array:
+    """Return sums (B, C) of values (N, C) at times t (N,) [s] over blocks of this length [s]."""
+    number = np.floor(t / block).astype(np.intp)
+    return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(number, prepend=number[0] - 1)), axis=0))
