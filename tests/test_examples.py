@@ -14,7 +14,7 @@ WITH_EXAMPLES = sorted(path for path in SOURCE.rglob("*.py") if ">>> " in path.r
 
 def test_the_public_face_has_examples() -> None:
     names = {path.stem for path in WITH_EXAMPLES}
-    assert {"wheel", "vehicle", "soils", "entry_angle", "posterior", "tracker"} <= names
+    assert {"wheel", "vehicle", "soils", "entry_angle", "posterior", "search_budget"} <= names
 
 
 @pytest.mark.parametrize("path", WITH_EXAMPLES, ids=lambda path: str(path.relative_to(SOURCE)))
