@@ -1,7 +1,7 @@
 """A posterior of the soil as a few sigma points, and mean and standard deviation of what follows from them.
 
     log soil_d = log mode + L x_d                   x_d: points of `design` along principal directions, d = 1..D
-    log K_L of soil_d = to first order that of them, K_L = k_c / b + k_phi; k_c at most all of it
+    K_L = k_c / b + k_phi                           its logarithm is linear in x_d, too; k_c is at most all of it
     f(draw) = sum_d share(draw, d) f(soil_d)        response surface (Box & Wilson 1951): polynomial through them
     mean, std of g(f)                               over 256 draws of standard normals with exact low moments
 
@@ -50,8 +50,6 @@ _HELD_VARIANCE_RATIO = 1e-14
 """Variance of a direction over the largest one, below which the direction counts as known exactly."""
 LEAST_K_PHI = 1e-3
 """Least share of K_L that k_phi has at a point [1]: no force shows less."""
-MAX_STEP = 50.0
-"""Largest change of a logarithm [1], whose exponential is finite."""
 _K_C, _K_PHI, _PHI = (Soil._fields.index(name) for name in ("k_c", "k_phi", "phi"))
 
 
@@ -97,7 +95,7 @@ class SigmaPoints:
         leading = min(len(free), LEADING_DIRECTIONS)
         points = design(leading)
         steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, along])
-        soils = np.asarray(posterior.soil) * np.exp(np.minimum(steps, MAX_STEP))
+        soils = np.asarray(posterior.soil) * np.exp(steps)
         if width is not None:
             soils[:, [_K_C, _K_PHI]] = moduli(posterior.soil, steps, width)
         soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
@@ -132,7 +130,7 @@ def moduli(soil: Soil, steps: Array, width: float) -> Array:
     """Return k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
     part, whole = soil.k_c / width, soil.k_c / width + soil.k_phi
     K_L = whole * np.exp((part * steps[:, _K_C] + soil.k_phi * steps[:, _K_PHI]) / whole)
-    of_k_c = np.minimum(part * np.exp(np.minimum(steps[:, _K_C], MAX_STEP)), (1.0 - LEAST_K_PHI) * K_L)
+    of_k_c = np.minimum(part * np.exp(steps[:, _K_C]), (1.0 - LEAST_K_PHI) * K_L)
     return np.stack([of_k_c * width, K_L - of_k_c], axis=1)
 
 

@@ -103,12 +103,12 @@ def machine_line(results: Sequence[WindowResult]) -> str | None:
     if found is None:
         return None
     units = {"relaxation_length": "m", "wheel_inertia": "kg m^2"}
-    parts = [
-        (name.removeprefix("lateness.").replace("_", " ") + (" late by" if name.startswith("lateness.") else ""),
-         f"{of.value:.2g} +- {of.std:.2g} {units.get(name, 's')}")
-        for name, of in found.items()
-    ]  # fmt: skip
-    return "the machine, beside its torque: " + ", ".join(f"{name} {value}" for name, value in parts)
+    value = {name: f"{of.value:.2g} +- {of.std:.2g} {units.get(name, 's')}" for name, of in found.items()}
+    parts = [f"{name.replace('_', ' ')} {value[name]}" for name in units if name in value]
+    late = [
+        f"{name.removeprefix('lateness.').replace('_', ' ')} by {value[name]}" for name in value if name not in units
+    ]
+    return "of the machine: " + ", ".join(parts) + (f"; later than the torque: {', '.join(late)}" if late else "")
 
 
 def unused(results: Sequence[WindowResult]) -> int:
