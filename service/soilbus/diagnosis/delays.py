@@ -31,7 +31,7 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import inverse_covariance
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
-from soilbus.terra.effects.effect import Effect, Late
+from soilbus.terra.effects.effect import Late
 
 Cost = Callable[[float, float], float]
 """-2 log posterior, tempered, of dead time [s] and time constant [s]."""
@@ -94,26 +94,6 @@ def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior
                     gains[n_sensors + i] = free.standardised(best)
         starts.append(start._replace(gains=gains))
     return starts
-
-
-def exceeds_sampling_delay(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, divisor: float
-) -> bool:
-    """Whether an effect of a fitted model delays any channel by more than half its sample time, by `delay_sure_sd`.
-
-    A stamp says when a frame was on the bus: its value was measured up to a cycle before, half of one on average.
-    True where no channel's sample time is known.
-    """
-    half = {late: records[-1].training.sample_time(quantity) / 2.0 for quantity, late in effect.late.items()}
-    if not any(half.values()):
-        return True
-    totals = [
-        (posterior.total, half[late])
-        for (name, late), posterior in delay_posteriors(records, prior, fitted, divisor).items()
-        if name == effect.name
-    ]
-    sure_sd = records[0].options.delay_sure_sd
-    return any(abs(total.value) - sure_sd * total.std > of_cycle for total, of_cycle in totals)
 
 
 def delay_posteriors(

@@ -74,8 +74,7 @@ def detectable(
     equations = normal_equations(records, prior, present, candidates, free)
     found = []
     for effect in candidates:
-        least = _sampling_delay(effect, records[-1])
-        found.append(_detectable(effect, free, equations, data_ratio, required, least))
+        found.append(_detectable(effect, free, equations, data_ratio, required))
     return tuple(found)
 
 
@@ -85,7 +84,6 @@ def _detectable(
     equations: NormalEquations,
     data_ratio: float,
     required: float,
-    least: float,
 ) -> Detectable:
     parameter, recordings = effect.parameters[0], range(len(equations.iterates))
     most = _max_size(parameter)
@@ -100,17 +98,12 @@ def _detectable(
         cases = [(informations[0], required)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
     sizes = [min(_least_size(information, i, free, needed, most) for information, needed in cases) for i in first]
-    size = max(*sizes, least)
+    size = max(sizes)
     unseen = min(size, most)
     u = np.zeros(len(free))
     u[first[sizes.index(max(sizes))]] = unseen / parameter.std
     error = [_soil_error(equations, i, parts[i if effect.of_record else 0].response @ u) for i in recordings]
     return Detectable(effect, size if np.isfinite(size) else None, unseen, np.array(error))
-
-
-def _sampling_delay(effect: Effect, record: Record) -> float:
-    """Delay [s] of an effect's first channel below which it is none (see delays.exceeds_sampling_delay)."""
-    return max((record.training.sample_time(quantity) / 2.0 for quantity in [*effect.late][:1]), default=0.0)
 
 
 def _max_size(parameter: Parameter) -> float:

@@ -11,7 +11,7 @@ recordings could have shown.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from soilbus.diagnosis.delays import with_delays
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.gap import Gap, gap_of
+from soilbus.diagnosis.noise_floor import with_noise_floor
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.residual_terms import ResidualTerms, residual_terms
 from soilbus.diagnosis.search import Addition, FitCache, Search
@@ -125,6 +126,11 @@ def diagnose(
     options = records[0].options
     full = FitCache(records, prior, options)
     base = full.fit(records[0].training.effects)
+    for _ in range(options.noise_rounds if all(record.source is not None for record in records) else 0):
+        if base is not None:
+            records = with_noise_floor(records, base)
+            full = FitCache(records, prior, options)
+            base = full.fit(base.effects, [base.as_starts()])
     if base is not None and any(record.training.computes_loads for record in records):
         records = [
             record.with_weights_at(fit.optimum.at, check.at)
@@ -151,6 +157,13 @@ def diagnose(
         not present.converged and not present.held_out_chi2 < base.held_out_chi2
     ):  # such an end has no evidence, and predicts worse
         additions, present = [], base
+    if additions and all(record.source is not None for record in records):  # the noise without what they explain
+        progress("finding the noise floor")
+        records = with_noise_floor(records, present)
+        full = FitCache(records, prior, options)
+        again = full.fit(base.effects, [base.as_starts()]), full.fit(present.effects, [present.as_starts()])
+        if again[0] is not None and again[1] is not None:
+            base, present = again[0], replace(again[1], reported=present.reported)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)

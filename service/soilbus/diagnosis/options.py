@@ -26,6 +26,11 @@ class DiagnosisOptions:
     """Instants that each part of a recording must have, and residuals of a channel or region that is judged.  With 4
     and 24 instants, and with 20 residuals, no value of the golden diagnoses moves."""
 
+    least_noise_share: float = 0.02
+    """Share of its own noise [1] an instant that corrections of a kind must show for its noise floor to be found."""
+    noise_rounds: int = 2
+    """Fits after which noise floors are found anew, as those of kinds that share residuals hang on each other."""
+
     max_effects: int = 3
     """Effects that are added at most, and residual terms of a channel.  With 4 no value of the golden diagnoses moves,
     with 2 thrown soil is ambiguous in place of named."""
@@ -91,9 +96,6 @@ class DiagnosisOptions:
     """
     error_of_sum: float = 0.02
     """The same of the sum [1]."""
-    delay_sure_sd: float = 5.0
-    """Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the
-    pitch of a simulated drive is late that is not."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ steady states has no time: each third row in the order of slip is held out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import Linearisation, ObservationModelWithEffects
-from soilbus.estimation.options import HELD, SolverOptions
+from soilbus.estimation.options import SolverOptions
+from soilbus.estimation.variance_components import VarianceComponents
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
@@ -50,6 +51,10 @@ class Record:
         Of its diagnosis.
     of_type
         Names of the model's effects that other vehicles share, and whose sizes these have determined.
+    source
+        Window, rig, model and limits of speed and turn that it was made of; None of a table.
+    noise
+        Factor on [noise]'s variances by kind of sensor (`noise_floor`).
     """
 
     name: str
@@ -60,6 +65,19 @@ class Record:
     fold: NDArray[np.intp] | None = None
     options: DiagnosisOptions = DEFAULT
     of_type: frozenset[str] = frozenset()
+    source: tuple[Window, Rig, WheelModel, float, float] | None = None
+    noise: Mapping[str, float] = field(default_factory=dict)
+
+    def with_noise(self, factor: Mapping[str, float]) -> Record:
+        """The same with the variances of each kind of sensor times a factor; a table as it is."""
+        if self.source is None:
+            return self
+        window, rig, model, min_speed, max_turn = self.source
+        scaled = VarianceComponents(rig.options.variance).after(factor, whole=True).scaled(window, rig)
+        effects, free, of_type = self.training.effects, self.training.free, self.of_type
+        again = record_of(self.name, scaled, rig, model, min_speed, max_turn, self.options)
+        again = again.with_effects(effects, free, self.joint_prior)
+        return replace(again, of_type=of_type, source=self.source, noise=factor)
 
     def with_effects(
         self, effects: Sequence[Effect], free: Sequence[Free], joint_prior: Gaussian | None = None
@@ -98,9 +116,10 @@ class Record:
 
 
 def diagnosed(rig: Rig) -> Rig:
-    """Return the rig without standing parts: inertia and lateness are effects to be named; descents end nearer."""
+    """Return the rig with the inertia of bare wheels, what is more is an effect; descents end nearer."""
     search = replace(rig.options.search, cold=SolverOptions(100), warm=SolverOptions(100, step_tolerance=2e-4))
-    return replace(rig, options=replace(rig.options, search=search, standing=HELD))
+    standing = replace(rig.options.standing, wheel_inertia=1.0)
+    return replace(rig, options=replace(rig.options, search=search, standing=standing))
 
 
 def record_of(
@@ -132,7 +151,8 @@ def record_of(
     TooLittle
         Where the recording has not enough usable instants.
     """
-    problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed, max_turn).on_curves()
+    problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed, max_turn)
+    problem = problem.with_own_stamps().on_curves()
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
@@ -141,7 +161,8 @@ def record_of(
     training, held_out = (problem.part(part) for part in parts)
     if not (training.n_rows and held_out.n_rows):
         raise TooLittle(f"{name}: neither a torque nor a draft is known with its load, slip and slope at once")
-    return Record(name, training, held_out, whole=problem, fold=fold, options=options)
+    source = window, rig, model, min_speed, max_turn
+    return Record(name, training, held_out, whole=problem, fold=fold, options=options, source=source)
 
 
 def record_of_rows(

@@ -16,9 +16,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from soilbus.diagnosis.delays import exceeds_sampling_delay
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
-from soilbus.diagnosis.gap import gap_of_fold
 from soilbus.diagnosis.joint_fit import Start
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
@@ -145,9 +143,7 @@ class Search:
         key = frozenset(model.names)
         if key not in self._compared:
             self._compared[key] = {
-                name: fit
-                for name, fit in self._fits(model)
-                if fit.neg2_log_evidence < model.neg2_log_evidence and not self._is_sampling_delay(model, fit)
+                name: fit for name, fit in self._fits(model) if fit.neg2_log_evidence < model.neg2_log_evidence
             }
         return self._compared[key]
 
@@ -209,15 +205,6 @@ class Search:
         """Whether an effect explains less than the required fall."""
         required = required_fall_beside(self.full.records, without, self.temperature, self.excess, self.options)
         return without.neg2_log_evidence - model.neg2_log_evidence < required
-
-    def _is_sampling_delay(self, without: FittedModel, model: FittedModel) -> bool:
-        """Whether the last effect is a delay within a bus cycle only, beside a model with which nothing disagrees."""
-        effect = model.effects[-1]
-        return (
-            bool(effect.late)
-            and not gap_of_fold(without).exceeds_noise(self.options)
-            and not exceeds_sampling_delay(self.full.records, self.full.prior, model, effect, self.temperature)
-        )
 
 
 def excess_without_effects(

@@ -136,7 +136,7 @@ def _regions(
 def _gain_tests(fitted: FittedModel) -> Iterator[tuple[float, Disagreement]]:
     """Tests of the gain errors against their priors: a fit may hide an effect in them."""
     problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
-    for i in range(problem.n_sensors):
+    for i in range(problem.layout.standing.start):
         std = float(problem.gain_std[i])
         shift_variance = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # of the posterior mean, under noise
         if std > 0.0 and shift_variance > _ROUNDING * std**2:

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from typing import Self
+from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
 from soilbus.estimation.local_cubics import Series, curve_of
-from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
+from soilbus.estimation.standing import STANDING, StandingColumns, slope, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -196,6 +197,41 @@ class Measurements:
         self.standing_rows[:, self.n_wheels] = columns.demand[kept]
         self.standing_rows[~self._known] = 0.0
         self.standing_latents = latents
+
+    def with_own_stamps(self) -> Self:
+        """The same with each torque late by a gain of its own too, and standing parts by the slopes of smooth curves.
+
+        The prior sd of a lateness is half the channel's sample time, as a stamp is up to a cycle later than its value.
+        """
+        if self.rig.chassis is None:
+            return self
+        window = self._curves.window
+        smooth = {
+            quantity: np.stack([curve.smooth.at(window.t)[0] for curve in self._curves.of(quantity)], axis=1)
+            for quantity in ("torque", "load", "speed", "ground_speed", "draft", "acceleration")
+        }
+        shaped: dict[str, Any] = {
+            quantity: values.reshape(getattr(window, quantity).shape) for quantity, values in smooth.items()
+        }
+        stamped, W = copy(self), self.n_wheels
+        kept = np.searchsorted(window.t, self.t)
+        stamped._stand(standing_columns(replace(window, **shaped), self.rig), kept)
+        own = np.zeros((*stamped.standing_rows.shape[:2], W))
+        slopes = slope(window.t, smooth["torque"])[kept]
+        own[:, :W] = (
+            np.eye(W) * slopes[:, None] if self._torque_matrix is None else self._torque_matrix * slopes[:, None]
+        )
+        own[~self._known] = 0.0
+        stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
+        nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
+        stamped.standing_latents = np.concatenate([stamped.standing_latents, nothing], axis=2)
+        first = self.n_sensors - len(STANDING)
+        late = [name.removeprefix("lateness.") for name in STANDING[2:]]
+        half = [self.sample_time(quantity) / 2.0 for quantity in [*late, *["torque"] * W]]
+        stamped.gain_names = [*self.gain_names[: self.n_sensors], *(f"lateness.torque.{w}" for w in self.rig.wheels)]
+        stamped.gain_std = np.concatenate([self.gain_std[: first + 2], half])
+        stamped.n_sensors = len(stamped.gain_names)
+        return stamped
 
     def on_curves(self) -> Self:
         """The same with latents on smooth curves of what is measured, where two wheels share a torque.

@@ -277,6 +277,13 @@ class ObservationModel(Measurements):
         self.layout = Layout.of(self.n_wheels, self.n_sensors)
         self.gain_bounds = np.full((2, len(self.gain_std)), [[-np.inf], [np.inf]])
 
+    def with_own_stamps(self) -> Self:
+        """As `Measurements.with_own_stamps`; without effects."""
+        stamped = super().with_own_stamps()
+        stamped.layout = Layout.of(self.n_wheels, stamped.n_sensors)
+        stamped.gain_bounds = np.full((2, stamped.n_sensors), [[-np.inf], [np.inf]])
+        return stamped
+
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals, their derivatives and their inverse covariance at one point.
 

@@ -22,7 +22,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
-__all__ = ["STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
+__all__ = ["STANDING", "StandingColumns", "slope", "standing_columns", "standing_std", "wheel_inertia"]
 
 STANDING = (
     "relaxation_length", "wheel_inertia", "lateness.load", "lateness.ground_speed", "lateness.draft",
@@ -63,13 +63,13 @@ def standing_columns(window: Window, rig: Rig) -> StandingColumns:
     t, ground = window.t, window.ground_speed[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = 1.0 - ground / (rig.radius * window.speed)
-        relaxed = -_slope(t, slip) / ground * (rig.radius * window.speed**2 / ground)
+        relaxed = -slope(t, slip) / ground * (rig.radius * window.speed**2 / ground)
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
-    columns.torque[:, :, 1] = -wheel_inertia(rig) * _slope(t, window.speed)
-    columns.latents[:, :W, 2] = _slope(t, window.load) if _measures_loads(rig) else 0.0
-    columns.latents[:, 2 * W, 3] = _slope(t, ground)[:, 0]
-    columns.demand[:, 4] = _slope(t, window.draft[:, None])[:, 0]
-    columns.demand[:, 5] = rig.chassis.mass * _slope(t, window.acceleration[:, None])[:, 0]
+    columns.torque[:, :, 1] = -wheel_inertia(rig) * slope(t, window.speed)
+    columns.latents[:, :W, 2] = slope(t, window.load) if _measures_loads(rig) else 0.0
+    columns.latents[:, 2 * W, 3] = slope(t, ground)[:, 0]
+    columns.demand[:, 4] = slope(t, window.draft[:, None])[:, 0]
+    columns.demand[:, 5] = rig.chassis.mass * slope(t, window.acceleration[:, None])[:, 0]
     return columns
 
 
@@ -78,7 +78,7 @@ def _measures_loads(rig: Rig) -> bool:
     return given is None or all(row.kind == "channel" for row in given.load)
 
 
-def _slope(t: Array, values: Array) -> Array:
+def slope(t: Array, values: Array) -> Array:
     """Return slopes (N, C) of values (N, C) over times t (N,) [s]; 0 where a neighbour is unknown."""
-    slope = np.gradient(values, t, axis=0)
-    return np.where(np.isfinite(slope), slope, 0.0)
+    found = np.gradient(values, t, axis=0)
+    return np.where(np.isfinite(found), found, 0.0)

@@ -14,14 +14,14 @@ instants: noise that averages out within a second is still in each instant's loa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import Row
-from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, Optimum
+from soilbus.estimation.observation_model import RESIDUAL, Linearisation, ObservationModel, Optimum
 from soilbus.estimation.options import VarianceOptions
 from soilbus.estimation.window import Rig, Window
 
@@ -90,9 +90,19 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     options : VarianceOptions
         Length of a block.
     """
-    A, (N, m) = optimum.at.by_latents, optimum.at.by_latents.shape[:2]
-    e = optimum.at.weighed[:, RESIDUAL].reshape(N, m)
-    variance, row_var = problem.variances(optimum.gains)
+    found = {}
+    for kind, value, expected in corrections(problem, optimum.at, optimum.gains):
+        total = float(expected.sum())
+        if total > options.least_share * problem.n:
+            found[kind] = max(float((s**2).sum()) for s in (value, block_sums(value, problem.t, options.block))) / total
+    return found
+
+
+def corrections(problem: ObservationModel, at: Linearisation, gains: Array) -> Iterator[tuple[str, Array, Array]]:
+    """Yield each kind of sensor with its corrections (N, C) at a fit, in its own sd, and their expected squares."""
+    A, (N, m) = at.by_latents, at.by_latents.shape[:2]
+    e = at.weighed[:, RESIDUAL].reshape(N, m)
+    variance, row_var = problem.variances(gains)
     inverse = problem.inverse_covariance(A, variance, row_var)
     by_latents = np.einsum("nml,nm->nl", A, e)
     shares = variance * np.einsum("nml,nmk,nkl->nl", A, inverse, A, optimize=True)
@@ -100,12 +110,11 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     layout, known = problem.layout, problem.known
     known = known & problem.measured_rows
     rows = np.where(known, np.sqrt(row_var) * e, 0.0), np.where(known, of_rows, 0.0)
-    corrections, measured = np.sqrt(variance) * by_latents, problem.measured_latents
+    correction, measured = np.sqrt(variance) * by_latents, problem.measured_latents
     if problem.rig.lengths is not None:  # a track's load is the mean of a window, and single instants do not show it
         shares[:, layout.loads] = np.where(problem.rig.lengths > 0.0, 0.0, shares[:, layout.loads])
-    latents = corrections, np.where(measured, shares, 0.0)
-    computed = corrections, np.where(measured, 0.0, shares)
-    found = {}
+    latents = correction, np.where(measured, shares, 0.0)
+    computed = correction, np.where(measured, 0.0, shares)
     for kind, (values, expected), columns in (
         ("torque", rows, layout.torques),
         ("draft", rows, slice(layout.balance, layout.balance + 1)),
@@ -115,11 +124,7 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
         ("speed", latents, layout.speeds),
         ("ground_speed", latents, slice(layout.ground_speed, layout.ground_speed + 1)),
     ):
-        total = float(expected[:, columns].sum())
-        if total > options.least_share * N:
-            value = np.where(expected[:, columns] > 0.0, values[:, columns], 0.0)
-            found[kind] = max(float((s**2).sum()) for s in (value, block_sums(value, problem.t, options.block))) / total
-    return found
+        yield kind, np.where(expected[:, columns] > 0.0, values[:, columns], 0.0), expected[:, columns]
 
 
 def block_sums(values: Array, t: Array, block: float) -> Array:
