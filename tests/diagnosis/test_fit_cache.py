@@ -34,7 +34,6 @@ def asked(monkeypatch):
             if cost is None
             else Fitted(
                 neg2_log_posterior=cost,
-                neg2_log_evidence=cost + 10.0,
                 converged=True,
                 effects=tuple(effects),
                 names=tuple(e.name for e in effects),

@@ -1,4 +1,4 @@
-"""The gap over all blocks, each held out in turn, against fits from scratch to each choice of blocks."""
+"""The gap over all blocks, each predicted from the others, against fits from scratch to each choice of blocks."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fitted_model import FittedModel, fit_model
-from soilbus.diagnosis.gap import Gap, gap_of, gap_of_fold
+from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.gap import gap_of
+from soilbus.diagnosis.noise_floor import with_noise_floor
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.solver import Termination
-from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import REFERENCES, reference_configuration
+from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
@@ -24,11 +23,14 @@ from soilbus.terra.effects.effect import Active
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
 SECONDS = 36.0
-FOLDS = 3
+BLOCKS = 9
+HALF = ["noise.torque.of_mean=0.005", "noise.draft.absolute=20"]
+TWICE = ["noise.torque.of_mean=0.02", "noise.draft.absolute=80"]
 
 
-def record_with(effects=()):
-    rig, store = rig_of(CONFIG), Bins(rig_of(CONFIG), 0.1, 0.0)
+def record_with(effects=(), noise=()):
+    config = reference_configuration(list(noise))
+    rig, store = rig_of(config), Bins(rig_of(config), 0.1, 0.0)
     channels = simulate(CONFIG, excited("loam", SECONDS), 4, effects).channels
     store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
     return record_of("drive", store.window(0.0, SECONDS), rig, model_of(CONFIG), 0.2, 0.15)
@@ -40,11 +42,18 @@ def record():
     return record_with((Active(gain, {"gain": 0.05}),))
 
 
+def without(record: Record, block: int) -> Record:
+    """The record with this block of 4 s held out."""
+    is_held_out = (record.whole.since / 4.0).astype(int) == block
+    training, held_out = (record.whole.part(np.flatnonzero(part)) for part in (~is_held_out, is_held_out))
+    return replace(record, training=training, held_out=held_out)
+
+
 @pytest.mark.parametrize("effects", [(), ("draft_gain",)])
-def test_the_gap_is_that_of_fits_to_each_choice_of_blocks(record, effects):
+def test_the_gap_is_that_of_fits_to_all_blocks_but_one(record, effects):
     catalogue = [CATALOGUE[name] for name in effects]
-    reported = gap_of([record], PRIOR, fit_model([record], PRIOR, catalogue))
-    fits = [fit_model([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(FOLDS)]
+    reported = gap_of(fit_model([record], PRIOR, catalogue))
+    fits = [fit_model([without(record, block)], PRIOR, catalogue) for block in range(BLOCKS)]
     rows = [fit.checked_rows for fit in fits]
     assert reported.rows == sum(rows)
     expected = sum(fit.held_out_chi2 * n for fit, n in zip(fits, rows, strict=True)) / sum(rows)
@@ -52,72 +61,19 @@ def test_the_gap_is_that_of_fits_to_each_choice_of_blocks(record, effects):
     assert abs(reported.value - 1.0) < 4.0 * math.sqrt(2.0 / reported.rows) or not effects
 
 
-def test_every_instant_is_held_out_once(record):
-    held_out = [record.with_held_out(fold).held_out.t for fold in range(FOLDS)]
-    assert np.array_equal(np.sort(np.concatenate(held_out)), record.whole.t)
-    assert np.array_equal(held_out[-1], record.held_out.t)
-    for fold in range(FOLDS):
-        turned = record.with_held_out(fold)
-        assert not set(turned.training.t.tolist()) & set(turned.held_out.t.tolist())
+def test_a_score_does_not_depend_on_which_blocks_the_model_was_fitted_to(record):
+    scores = [fit_model([without(record, block)], PRIOR, ()).score for block in range(3)]
+    assert np.ptp(scores) < 2.0
 
 
-def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
-    """Tables, and a model that did not converge; a gap that a third of the blocks shows is of all folds."""
-    found = fit_model([record], PRIOR, ())
-    alone = gap_of_fold(found)
-    assert alone[:2] == pytest.approx((found.held_out_chi2, found.checked_rows))
-    assert gap_of([replace(record, whole=None, fold=None)], PRIOR, found) == alone
-    creeping = replace(found, fits=tuple(replace(fit, termination=Termination.LIMIT) for fit in found.fits))
-    assert gap_of([record], PRIOR, creeping) == alone
-    clear = replace(found, checks=tuple(replace(check, chi2=3.0 * check.rows) for check in found.checks))
-    assert gap_of([record], PRIOR, clear).rows > gap_of_fold(clear).rows
-
-
-@pytest.mark.parametrize("machine", ["tractor-axles", "tractor-2wd"])
-def test_where_loads_are_computed_noise_alone_makes_one(machine):
-    """And noise twice that of the configuration makes more than noise does: no agreement."""
-    sound, noisy = (
-        gap_of_drive(machine, ["noise.torque.of_mean=0.02", "noise.draft.absolute=80"] if double else [])
-        for double in (False, True)
-    )
-    assert abs(sound.value - 1.0) < 4.0 * math.sqrt(2.0 * sound.open_loads / sound.rows)
-    assert not sound.exceeds_noise()
-    assert noisy.exceeds_noise()
-    assert noisy.with_open_loads < 1.0 < noisy.open_loads
-
-
-def test_without_any_load_cell_noise_alone_makes_one_too():
-    cells = reference_configuration()
-    config = cells.model_copy(update={"wheel": [w.model_copy(update={"load": None}) for w in cells.wheel]})
-    record, fitted = weighed(record_of_recording("drive", simulate(config, excited("loam", SECONDS), 4), config))
-    found = gap_of([record], PRIOR, fitted)
-    assert abs(found.value - 1.0) < 4.0 * math.sqrt(2.0 * found.open_loads / found.rows)
-    assert found.with_open_loads < 0.7
-    assert not found.exceeds_noise()
-
-
-def test_a_model_far_off_does_not_hide_in_its_own_weights():
-    """A speed 0.4 s late bends the gains so that computed loads seem to leave more open: the shared weights stay."""
-    config = reference_configuration(path=REFERENCES["tractor-axles"])
-    lag = Active(CATALOGUE["channel_lag"], CATALOGUE["channel_lag"].neutral | {"ground_speed_delay": 0.4})
-    made = simulate(config, excited("loam", SECONDS), 4, (lag,))
-    _, fitted = weighed(record_of_recording("drive", made, config))
-    found = gap_of_fold(fitted)
-    assert fitted.held_out_chi2 < 1.5
-    assert found.value > 2.0 > found.limit()
-
-
-def gap_of_drive(machine: str, noise: list[str]) -> Gap:
-    """The gap of a machine without load cells, whose sensors have this noise, beside what its configuration says."""
-    path = REFERENCES[machine]
-    config = reference_configuration(path=path)
-    made = simulate(reference_configuration(noise, path=path), excited("loam", SECONDS), 4)
-    record, fitted = weighed(record_of_recording("drive", made, config))
-    return gap_of([record], PRIOR, fitted)
-
-
-def weighed(record: Record) -> tuple[Record, FittedModel]:
-    """The record with the weights of its fit, which all models share, and the fit with these: as `diagnose` does it."""
-    first = fit_model([record], PRIOR, ())
-    record = record.with_weights_at(first.fits[0].optimum.at, first.checks[0].at)
-    return record, fit_model([record], PRIOR, (), first.as_starts())
+def test_the_noise_is_that_of_the_recording_whatever_the_configuration_says(record):
+    """Gaps by a configuration with half and twice the noise are those by the right one."""
+    found = [gap_of(fit_model([record_with((), noise)], PRIOR, ())).value for noise in ([], HALF, TWICE)]
+    assert found[1] > 1.1
+    assert found[2] < 0.9
+    for noise in ([], HALF, TWICE):
+        records = [record_with((), noise)]
+        for _ in range(2):
+            records = with_noise_floor(records, fit_model(records, PRIOR, ()))
+        gap = gap_of(fit_model(records, PRIOR, ()))
+        assert abs(gap.value - 1.0) < 4.0 * math.sqrt(2.0 / gap.rows)

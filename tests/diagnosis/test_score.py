@@ -35,7 +35,7 @@ def test_an_error_that_is_not_there_is_not_found_where_gains_are_loose(name):
     effect = CATALOGUE[name]
     (score,) = scores([record], prior, base, [effect])
     completed = fit_model([record], prior, (effect,), score.starts)
-    assert base.neg2_log_evidence < completed.neg2_log_evidence
+    assert base.score < completed.score
     first = completed.parameters()[name][effect.parameters[0].name]
     assert abs(first.value) < 2.0 * first.std
 

@@ -87,7 +87,7 @@ def test_scores_from_further_starts_are_the_same_together_as_alone(record, base)
     for name, score in together.items():
         (alone,) = further_scores([record], PRIOR, base, [CATALOGUE[name]])
         assert score.effect is CATALOGUE[name]
-        assert score.neg2_log_evidence == pytest.approx(alone.neg2_log_evidence, rel=1e-6, abs=1e-6)
+        assert score.change == pytest.approx(alone.change, rel=1e-6, abs=1e-6)
         assert score.starts[0].gains == pytest.approx(alone.starts[0].gains, rel=1e-6, abs=1e-9)
 
 

@@ -96,7 +96,7 @@ def test_the_predicted_separation_is_what_a_drive_then_adds():
         further = recorded(plan.manoeuvre.over(ground), seed, LOSS)
         for name, found in gained.items():
             alone, both = (
-                [fit_model(records, PRIOR, (CATALOGUE[n],)).neg2_log_evidence for n in (name, "drivetrain_loss")]
+                [fit_model(records, PRIOR, (CATALOGUE[n],)).score for n in (name, "drivetrain_loss")]
                 for records in ([first], [first, further])
             )
             found.append((both[0] - both[1]) - (alone[0] - alone[1]))

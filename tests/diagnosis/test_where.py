@@ -100,7 +100,7 @@ def test_regions_of_an_axles_torque_are_of_its_own_wheels():
     """The rear motor reads too much at great slip of the rear wheels; the front right one has slips of its own."""
 
     def error(t, slip, speed):
-        return np.where(slip > 0.25, 1500.0, 0.0)
+        return np.where(slip > 0.25, 3000.0, 0.0)
 
     record = recorded("loam", 60.0, 3, "torque.rear", error, rig_of(AXLES), AXLES)
     base = fit_model([record], prior_of(AXLES), ())

@@ -108,11 +108,7 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path) -> dict[str, Beside]
     }
     known = fits["nothing"]
     assert known is not None
-    return {
-        n: Beside(known.neg2_log_evidence - fit.neg2_log_evidence, strain(fit))
-        for n, fit in fits.items()
-        if fit is not None
-    }
+    return {n: Beside(known.score - fit.score, strain(fit)) for n, fit in fits.items() if fit is not None}
 
 
 def strain(fitted: FittedModel) -> float:

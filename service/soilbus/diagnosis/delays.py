@@ -1,6 +1,6 @@
 """How late a channel is: joint posterior of the dead time d and the time constant tau of its low pass.
 
-    p(d, tau) ~ exp(-cost(d, tau) / 2),  cost = squared prior terms + sum over recordings of min -2 log posterior / T
+    p(d, tau) ~ exp(-cost(d, tau) / 2),  cost = squared prior terms + sum over recordings of min -2 log posterior
     E[x] = integral over tau and d + tau of  exp(-cost / 2) x            on a grid along the ridge
 
 Evenly driven recordings determine the sum d + tau well and its parts hardly: the effect of tau beyond the sum goes
@@ -34,7 +34,7 @@ from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Late
 
 Cost = Callable[[float, float], float]
-"""-2 log posterior, tempered, of dead time [s] and time constant [s]."""
+"""-2 log posterior of dead time [s] and time constant [s]."""
 
 _SOIL = len(PARAMETERS)
 
@@ -52,10 +52,10 @@ class DelayPosterior(NamedTuple):
     fall: float
 
 
-def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float) -> FittedModel:
+def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> FittedModel:
     """A fitted model that reports delays by their joint posteriors.
 
-    Fitted again from the best delays where these lower -2 log posterior, tempered, by more than `negligible_fall`.
+    Fitted again from the best delays where these lower -2 log posterior by more than `negligible_fall`.
 
     Parameters
     ----------
@@ -63,14 +63,12 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
         Those of the fit.
     fitted
         The model.
-    divisor
-        The temperature.
     """
-    found = delay_posteriors(records, prior, fitted, divisor)
-    if any(posterior.fall > records[0].options.negligible_fall * divisor for posterior in found.values()):
+    found = delay_posteriors(records, prior, fitted)
+    if any(posterior.fall > records[0].options.negligible_fall for posterior in found.values()):
         better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
-        if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
-            fitted, found = better, delay_posteriors(records, prior, better, divisor)
+        if better is not None and better.score < fitted.score:
+            fitted, found = better, delay_posteriors(records, prior, better)
     reported: dict[tuple[str, str], Estimate] = {}
     for (name, late), posterior in found.items():
         reported |= {
@@ -97,7 +95,7 @@ def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior
 
 
 def delay_posteriors(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
 ) -> dict[tuple[str, Late], DelayPosterior]:
     """The posterior of each channel that a fitted model lets be late, by effect and names of its parameters.
 
@@ -109,13 +107,11 @@ def delay_posteriors(
             names = [(f.effect, f.parameter.name) for f in fitted.free_unheld]
             at = names.index((effect.name, late.delay)), names.index((effect.name, late.time_constant))
             if all(fitted.free_unheld[i].std > 0.0 for i in at):
-                found[effect.name, late] = _posterior(records, prior, fitted, at, divisor)
+                found[effect.name, late] = _posterior(records, prior, fitted, at)
     return found
 
 
-def _posterior(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, at: tuple[int, int], divisor: float
-) -> DelayPosterior:
+def _posterior(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, at: tuple[int, int]) -> DelayPosterior:
     """The posterior of the parameters at two indices (dead time, time constant)."""
     first, second = (fitted.free_unheld[i] for i in at)
     here = tuple(fitted.free[i].at(_standardised(fitted, i)) for i in at)
@@ -123,7 +119,7 @@ def _posterior(
 
     def cost(delay: float, tau: float) -> float:
         of_prior = first.standardised(delay) ** 2 + second.standardised(tau) ** 2
-        return of_prior + profile.cost(delay, tau) / divisor
+        return of_prior + profile.cost(delay, tau)
 
     options, low, high = records[0].options, first.parameter.low, first.parameter.high
     most = min(second.parameter.high, max(sum(here) - low, options.delay_step) + 2.0 * options.delay_step)
@@ -157,7 +153,7 @@ def _posterior(
         estimate_of(tau, tau_cell, options.error_of_parts),
         estimate_of(total, sum_cell, options.error_of_sum),
         (float(ridge.total[best] - ridge.tau[best]), float(ridge.tau[best])),
-        divisor * (cost(*here) - float(ridge.cost[best])),
+        (cost(*here) - float(ridge.cost[best])),
     )
 
 

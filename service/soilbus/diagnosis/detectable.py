@@ -1,7 +1,7 @@
 """What these recordings could have shown: the size from which each effect would have been added.
 
     E[information vector] = H u  for an effect of parameters u (P,), in units of their prior std
-    detectable size: the u at which the expected fall of -2 log evidence equals the required fall
+    detectable size: the u at which the expected fall of the score equals the required one
 
 H (P, P) is the Fisher information of the parameters after soil, gains and the model's effects have taken up what they
 can (Schur complement).  An effect of that size is missed every other time, one of twice the size hardly ever.  A
@@ -22,11 +22,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
+from soilbus.diagnosis.blocks import expected_change
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import NormalEquations, normal_equations
-from soilbus.diagnosis.search import excess_without_effects, required_fall_beside, temperature_beside
+from soilbus.diagnosis.verdict import FALL_OF_NONE
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import NORMAL_95, SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
@@ -65,16 +65,12 @@ def detectable(
     """The detectable size of every candidate beside the present model fitted to these recordings."""
     if not candidates:
         return ()
-    options = records[0].options
-    divisor = temperature_beside(records, prior, present, options)
-    excess = excess_without_effects(records, prior, present)
-    required = required_fall_beside(records, present, divisor, excess, options)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     free = [f for effect in candidates for f in parameters_of(effect, present.checks[0].problem.n_wheels)]
     equations = normal_equations(records, prior, present, candidates, free)
     found = []
     for effect in candidates:
-        found.append(_detectable(effect, free, equations, data_ratio, required))
+        found.append(_detectable(effect, free, equations, data_ratio))
     return tuple(found)
 
 
@@ -83,7 +79,6 @@ def _detectable(
     all_free: Sequence[Free],
     equations: NormalEquations,
     data_ratio: float,
-    required: float,
 ) -> Detectable:
     parameter, recordings = effect.parameters[0], range(len(equations.iterates))
     most = _max_size(parameter)
@@ -91,11 +86,11 @@ def _detectable(
     free = [all_free[i] for i in columns.tolist()]
     parts = [equations.reduced(columns, i) for i in (recordings if effect.of_record else (0,))]
     informations = [data_ratio * one.information for one in parts]
+    cases = [(informations[0], FALL_OF_NONE)]
     if effect.of_record:  # in one recording, while the others pay for parameters that they do not need
-        unneeded = [_expected_change(information, np.zeros(len(free)), free) for information in informations]
-        cases = [(one, required + sum(unneeded) - own) for one, own in zip(informations, unneeded, strict=True)]
-    else:
-        cases = [(informations[0], required)]
+        unneeded = [_expected_change(information, np.zeros(len(free))) for information in informations]
+        others = sum(unneeded)
+        cases = [(one, FALL_OF_NONE + others - own) for one, own in zip(informations, unneeded, strict=True)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
     sizes = [min(_least_size(information, i, free, needed, most) for information, needed in cases) for i in first]
     size = max(sizes)
@@ -113,21 +108,21 @@ def _max_size(parameter: Parameter) -> float:
 
 
 def _least_size(information: Array, index: int, free: Sequence[Free], required: float, largest: float) -> float:
-    """Size of one parameter from which the expected fall of -2 log evidence reaches the required one; else infinite."""
+    """Size of one parameter from which the expected fall of the score reaches the required one; else infinite."""
     direction = np.eye(len(free))[index]
     parameter = free[index].parameter
 
     def excess(size: float) -> float:
-        """Change of -2 log evidence above the negative of the required fall."""
-        return _expected_change(information, size * direction, free) + required
+        """Change of the score above the negative of the required fall."""
+        return _expected_change(information, size * direction) + required
 
     most = largest / parameter.std
     return float(brentq(excess, 0.0, most)) * parameter.std if excess(most) <= 0.0 else np.inf
 
 
-def _expected_change(information: Array, u: Array, free: Sequence[Free]) -> float:
-    """Change of -2 log evidence by the effect where its parameters are u (P,) and there is no noise."""
-    return mixture_neg2_log_evidence(information, information @ u, free)
+def _expected_change(information: Array, u: Array) -> float:
+    """Change of the score by the effect where its parameters are u (P,) and there is no noise."""
+    return expected_change(information, information @ u)
 
 
 def _soil_error(equations: NormalEquations, record: int, follow: Array) -> Array:

@@ -1,9 +1,11 @@
 """The diagnosis: where model and data disagree, which effects are missing, and how much of the gap they explain.
 
-    gap = reduced chi-square of held-out blocks (`gap`);  fall = -2 log evidence before - after an effect is added
+    gap  = reduced chi-square of blocks, each predicted from all others (`blocks`, `gap`)
+    fall = score before - after an effect is added
 
-The present model is fitted and its held-out residuals are tested place by place (`where`).  Effects are added one at a
-time, at most three, by stepwise search (`search`); `verdict` turns evidences and remaining gap into a verdict.
+The noise is that of the recording itself (`noise_floor`).  The present model is fitted and its held-out residuals are
+tested place by place (`where`).  Effects are added one at a time, at most three, by stepwise search (`search`);
+`verdict` turns scores and remaining gap into a verdict.
 Where the verdict is unknown, `residual_terms` describes what remains; where it is none, `detectable` says what these
 recordings could have shown.
 """
@@ -24,7 +26,7 @@ from soilbus.diagnosis.noise_floor import with_noise_floor
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.residual_terms import ResidualTerms, residual_terms
 from soilbus.diagnosis.search import Addition, FitCache, Search
-from soilbus.diagnosis.verdict import Verdict, temperature, verdict_of
+from soilbus.diagnosis.verdict import Verdict, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -63,8 +65,6 @@ class Diagnosis:
     rivals
         Where the verdict is ambiguous, the fitted models between which it is, the completed one first: they differ in
         the effect of the least probable name.
-    excess
-        Of the squared residuals without effects (search.excess_without_effects): it gives the temperature.
     """
 
     verdict: Verdict
@@ -78,7 +78,6 @@ class Diagnosis:
     imitation: tuple[float, ...] = ()
     detectable: tuple[Detectable, ...] = ()
     rivals: tuple[FittedModel, ...] = ()
-    excess: float = 0.0
 
     def soil_before(self, record: int) -> Posterior:
         """The soil of a recording under the present model."""
@@ -152,7 +151,7 @@ def diagnose(
         progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
-        present = with_delays(records, prior, present, temperature(present.excess, options))
+        present = with_delays(records, prior, present)
     if (
         not present.converged and not present.held_out_chi2 < base.held_out_chi2
     ):  # such an end has no evidence, and predicts worse
@@ -165,16 +164,14 @@ def diagnose(
         if again[0] is not None and again[1] is not None:
             base, present = again[0], replace(again[1], reported=present.reported)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
-    progress("holding out every block in turn")
-    before = gap_of(records, prior, base)
-    after = gap_of(records, prior, present) if additions else before
+    before, after = gap_of(base), gap_of(present)
     imitation = shares_alone(full, base, present, additions)
     chances = [addition.probability for addition in additions]
     rows = min(before.rows, after.rows)
     names = [addition.effect.name for addition in additions]
     is_doubtful = bool(imitation) or not base.converged or any(f.effect in names for f in present.at_limits)
-    verdict = verdict_of(before.with_open_loads, after.with_open_loads, rows, chances, is_doubtful, options)
-    explains = after.with_open_loads < before.with_open_loads
+    verdict = verdict_of(before.value, after.value, rows, chances, is_doubtful, options)
+    explains = after.value < before.value
     if verdict is Verdict.UNKNOWN and not explains:  # what explains nothing new is no name
         additions, present, after, imitation = [], base, before, ()
     remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
@@ -198,7 +195,6 @@ def diagnose(
         imitation,
         shown,
         rivals,
-        search.excess,
     )
 
 
@@ -229,10 +225,8 @@ def shares_alone(
     if len(additions) < full.options.max_effects:
         return ()
     alone = [full.fit((*base.effects, addition.effect)) for addition in additions]
-    together = base.neg2_log_evidence - present.neg2_log_evidence
-    shares = tuple(
-        0.0 if one is None else max(base.neg2_log_evidence - one.neg2_log_evidence, 0.0) / together for one in alone
-    )
+    together = base.score - present.score
+    shares = tuple(0.0 if one is None else max(base.score - one.score, 0.0) / together for one in alone)
     return () if abs(sum(shares) - 1.0) < full.options.max_overlap else shares
 
 

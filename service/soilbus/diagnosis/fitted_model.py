@@ -1,6 +1,6 @@
 """A model with effects, fitted to the recordings of one vehicle.
 
-    -2 log evidence = sum over recordings of [-2 log p(training blocks) - 2 log p(held-out blocks | training blocks)]
+    score = sum over recordings and blocks of -2 log p(block | all other blocks)        (`blocks`)
 
 Sensor gain errors and parameters of effects belong to the vehicle and are the same in all recordings.  The soil
 belongs to a recording, and so do the parameters of an effect of the record (see terra.effects.effect).  `joint_fit`
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, own_parameters
+from soilbus.diagnosis.blocks import BlockScores, Part, block_scores
 from soilbus.diagnosis.joint_fit import Start, fit_jointly, own_gains, priors_of
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
@@ -40,15 +40,13 @@ _SOIL = len(PARAMETERS)
 class HeldOutCheck:
     """Held-out blocks of one recording under a fitted model: the problem, its latents and the linearisation there.
 
-    neg2_log_evidence is -2 log p(held-out blocks | training blocks).  chi2 is the weighed square of the residuals,
-    with what the fit leaves uncertain of soil, gains and effects besides the noise: with a dozen training rows that is
-    no less than the noise itself.
+    chi2 is the weighed square of the residuals, with what the fit leaves uncertain of soil, gains and effects besides
+    the noise: with a dozen training rows that is no less than the noise itself.
     """
 
     problem: ObservationModelWithEffects
     latents: Latents
     at: Linearisation
-    neg2_log_evidence: float
     chi2: float
 
     @property
@@ -83,6 +81,24 @@ class Series(NamedTuple):
     since: Array
 
 
+class SizeLikelihood(NamedTuple):
+    """Likelihood of an effect's parameters (P,) about their neutral values, Gaussian around a fit.
+
+    Attributes
+    ----------
+    information : (P, P)
+        In units of the prior std.
+    vector : (P,)
+        Gradient of the log likelihood where the effect is absent.
+    free
+        The parameters.
+    """
+
+    information: Array
+    vector: Array
+    free: tuple[Free, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class FittedModel:
     """A model with effects as fitted: one Fit (training blocks) and one HeldOutCheck for each recording.
@@ -99,12 +115,10 @@ class FittedModel:
         Of soil, gains and parameters of each recording, with its part of the prior of what all share.
     fits, checks
         Of each recording.
-    mixture_correction
-        Change of -2 log evidence by the prior of unknown scale (see `evidence`).
+    blocks
+        Scores of all blocks of all recordings, in the order of these.
     reported
         Estimates by effect and parameter that replace the Gaussian ones, where the posterior is not Gaussian.
-    expected_chi2
-        Chi-square of all blocks by the sensors' noise alone: the number of residuals, less where loads are computed.
     """
 
     effects: tuple[Effect, ...]
@@ -113,9 +127,8 @@ class FittedModel:
     priors: tuple[Gaussian, ...]
     fits: tuple[Fit, ...]
     checks: tuple[HeldOutCheck, ...]
-    mixture_correction: float = 0.0
+    blocks: BlockScores
     reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
-    expected_chi2: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,29 +152,15 @@ class FittedModel:
         return {effect: names for effect, names in out.items() if names}
 
     @property
-    def neg2_log_evidence(self) -> float:
-        """-2 log of the marginal likelihood of all data, up to a constant.
-
-        Of the chi-square only what exceeds the expected one counts: where loads are computed, the weights of speeds
-        follow the model, and one that makes their noise larger would seem to fit better.
-        """
-        likelihoods = sum(fit.neg2_log_evidence for fit in self.fits) + self.held_out_neg2_log_evidence
-        return likelihoods + self.mixture_correction + self.rows - self.expected_chi2
-
-    @property
-    def held_out_neg2_log_evidence(self) -> float:
-        """-2 log of the predictive likelihood of the held-out blocks given the training blocks, up to a constant."""
-        return sum(check.neg2_log_evidence for check in self.checks)
+    def score(self) -> float:
+        """-2 log predictive likelihood of all blocks, each given the others, up to a constant."""
+        score = float(self.blocks.neg2_log.sum())
+        return score if np.isfinite(score) else np.inf
 
     @property
     def neg2_log_posterior(self) -> float:
         """-2 log posterior of the training blocks at the optimum, up to a constant."""
         return sum(fit.neg2_log_posterior for fit in self.fits)
-
-    @property
-    def excess(self) -> float:
-        """By how much the squared residuals of all blocks, in units of their variance, exceed what noise leaves."""
-        return self.neg2_log_posterior + self.held_out_chi2 * self.checked_rows - self.expected_chi2
 
     @property
     def held_out_chi2(self) -> float:
@@ -250,21 +249,14 @@ class FittedModel:
             for name, of in parts.items()
         ]
 
-    def own_parameters(self, effect: Effect) -> tuple[OwnParameters, ...]:
-        """Likelihood of each recording's own values of an effect; empty where the effect has none."""
-        own = [i for i in _not_held(effect, self.free) if effect.own_in_each_record(self.free[i].parameter)]
-        if not own:
-            return ()
-        n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
-        return tuple(own_parameters(*_moments(fit, n_sensors, own), free) for fit in self.fits)
-
-    def shared_parameters(self, effect: Effect) -> OwnParameters:
+    def size_likelihood(self, effect: Effect) -> SizeLikelihood:
         """Likelihood, by all recordings, of an effect's parameters that are the vehicle's; without held ones."""
-        shared = [i for i in _not_held(effect, self.free) if not effect.own_in_each_record(self.free[i].parameter)]
-        if not shared:
-            return OwnParameters(np.zeros((0, 0)), np.zeros(0), ())
-        n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in shared]
-        return own_parameters(*_moments(self.fits[-1], n_sensors, shared), free)
+        own = [i for i, f in enumerate(self.free) if f.effect == effect.name and f.std > 0.0]
+        shared = [i for i in own if not effect.own_in_each_record(self.free[i].parameter)]
+        at, mode = self.checks[0].problem.n_sensors + np.array(shared, int), self.fits[-1].mode
+        precision = np.linalg.inv(mode.covariance[np.ix_(_SOIL + at, _SOIL + at)])
+        information, vector = precision - np.eye(len(at)), precision @ mode.gains[at]
+        return SizeLikelihood(information, vector, tuple(self.free[i] for i in shared))
 
 
 def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
@@ -338,26 +330,24 @@ def fit_model(
         )
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
-    added = [effect for effect in effects if effect not in present.effects]
-    correction = sum(_mixture_correction(effect, free, fits, checks) for effect in added)
-    return FittedModel(
-        tuple(effects), free, free_unheld, priors, tuple(fits), tuple(checks), correction,
-        expected_chi2=_expected_chi2(records, effects, free, fits, checks),
-    )  # fmt: skip
-
-
-def _expected_chi2(
-    records: Sequence[Record],
-    effects: Sequence[Effect],
-    free: Sequence[Free],
-    fits: Sequence[Fit],
-    checks: Sequence[HeldOutCheck],
-) -> float:
-    """FittedModel.expected_chi2."""
-    return sum(
-        record.training.with_effects(effects, free).expected_chi2(fit.optimum.at, fit.optimum.gains)
-        + held_out.problem.expected_chi2(held_out.at, fit.mode.gains)
+    parts = [
+        _parts(record, record.training.with_effects(effects, free), fit, held_out)
         for record, fit, held_out in zip(records, fits, checks, strict=True)
+    ]
+    own = own_gains(records[0].training.n_sensors, effects, free)
+    with np.errstate(all="ignore"):
+        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own)
+    return FittedModel(tuple(effects), free, free_unheld, priors, tuple(fits), tuple(checks), blocks)
+
+
+def _parts(
+    record: Record, training: ObservationModelWithEffects, fit: Fit, held_out: HeldOutCheck
+) -> tuple[Part, Part]:
+    """The training blocks and the held-out blocks of a recording, linearised where it was fitted."""
+    problem, number, end, mode = held_out.problem, record.block_numbers, fit.optimum, fit.mode
+    return (
+        Part(end.soil, end.gains, end.at, number(training), training.known),
+        Part(mode.soil, mode.gains, held_out.at, number(problem), problem.known),
     )
 
 
@@ -370,8 +360,7 @@ def check(
 ) -> HeldOutCheck:
     """Held-out blocks under a model fitted to the others.
 
-    near: their latents under a model much like it.  Evidence and chi2 are
-    infinite where the model is not finite.
+    near: their latents under a model much like it.  chi2 is infinite where the model is not finite.
     """
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
     objective = Objective(problem, prior, fit.mode)
@@ -385,11 +374,8 @@ def check(
         quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents), at)
         step = None if quadratic is None else quadratic.step()
     if quadratic is None or step is None:
-        return HeldOutCheck(problem, latents, at, np.inf, np.inf)
-    length = quadratic.squared_length(step)
-    return HeldOutCheck(
-        problem, latents, at, quadratic.neg2_log_evidence - length, quadratic.neg2_log_posterior - length
-    )
+        return HeldOutCheck(problem, latents, at, np.inf)
+    return HeldOutCheck(problem, latents, at, quadratic.neg2_log_posterior - quadratic.squared_length(step))
 
 
 def _fits(
@@ -426,32 +412,3 @@ def _held_at_edges(
 def _start(fit: Fit, held_out: Latents | None = None) -> Start:
     """A start where a fit ended, with its latents."""
     return Start(fit.mode.soil, fit.mode.gains, True, fit.optimum.latents, held_out)
-
-
-def _mixture_correction(
-    effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[HeldOutCheck]
-) -> float:
-    """Change of -2 log evidence by the prior of unknown scale, for one effect.
-
-    Once; or, for an effect of the record, for each recording.  Parameters that all recordings share count with the
-    last one, whose posterior has the data of all.
-    """
-    n_sensors, total = checks[0].problem.n_sensors, 0.0
-    for fit in fits if effect.of_record else fits[-1:]:
-        members = [
-            f for f in _not_held(effect, free) if fit is fits[-1] or effect.own_in_each_record(free[f].parameter)
-        ]
-        if members:
-            total += mixture_correction(*_moments(fit, n_sensors, members), [free[i] for i in members])
-    return total
-
-
-def _not_held(effect: Effect, free: Sequence[Free]) -> list[int]:
-    """Indices of an effect's parameters that are not held."""
-    return [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
-
-
-def _moments(fit: Fit, n_sensors: int, members: Sequence[int]) -> tuple[Array, Array]:
-    """Posterior mean (P,) and covariance (P, P) of some of the effects' standardised parameters."""
-    gains = n_sensors + np.array(members)
-    return fit.mode.gains[gains], fit.mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)]

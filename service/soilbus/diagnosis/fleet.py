@@ -2,13 +2,13 @@
 
     expected share of false names in a set S = mean over S of (1 - P),  P = probability that the vehicle has the effect
     S = the largest set, taken in the order of P, whose expected share is at most FALSE_DISCOVERY_RATE
-    -2 log evidence(effect from log k on) = -2 log integral of prod(i >= k) L_i(u) dp(u),  u = the effect's size
+    score(effect from log k on) = that expected of prod(i >= k) L_i(u)  (`blocks`),  u = the effect's size
 
 Naming each vehicle's best effect would give a fleet of 10 000 hundreds of false names.  The set S bounds their expected
 share (Newton et al. 2004, Biostatistics 5:155).  A fault of a sensor begins at some day and then has one size: L_i is
-the likelihood of that size by log i alone (Gaussian around its fit), whose soil is its own; the integral is that of
-`evidence`, relative to an effect that is absent.  That no log has it is one more case, and its probability is taken
-from the name's: what all logs together seem to show, and none of them by itself, may be no fault of the vehicle.
+the likelihood of that size by log i alone (Gaussian around its fit), whose soil is its own.  That no log has it is one
+more case, and its probability is taken from the name's: what all logs together seem to show, and none of them by
+itself, may be no fault of the vehicle.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import softmax
 
+from soilbus.diagnosis.blocks import expected_change
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
-from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
-from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.fitted_model import SizeLikelihood, fit_model
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.vehicle_type import Factor, SharedEffect, factors_of, records_with, shared_effects
-from soilbus.diagnosis.verdict import Verdict, temperature
+from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
 
@@ -32,7 +31,6 @@ __all__ = [
     "FALSE_DISCOVERY_RATE",
     "Onset",
     "VehicleDiagnosis",
-    "diagnose_type",
     "diagnose_vehicle",
     "named",
     "onset_of",
@@ -79,13 +77,10 @@ class VehicleDiagnosis:
         Joint diagnosis of the logs that have the effects: all, or those from the onset of the first effect on.
     onsets
         Of each effect found, by name; none where there is one log only.
-    factors
-        What the logs say of the size of each effect that other vehicles may share, by name.
     """
 
     diagnosis: Diagnosis
     onsets: Mapping[str, Onset]
-    factors: Mapping[str, Factor]
 
     @property
     def places(self) -> list[dict[str, float]]:
@@ -142,11 +137,7 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
         # one value of the effect for all logs was wrong: it belongs to those from its onset on
         first, found = begin, diagnose(records[begin:], prior, catalogue)
         onsets = onsets_of(records, prior, found)
-    try:
-        factors = factors_of(records[first:], prior, found, catalogue)
-    except np.linalg.LinAlgError:  # the vehicle then says nothing of its type
-        factors = {}
-    return VehicleDiagnosis(found, onsets, factors)
+    return VehicleDiagnosis(found, onsets)
 
 
 def _first_diagnosis(records: Sequence[Record], prior: SoilPrior, catalogue: Sequence[Effect]) -> tuple[int, Diagnosis]:
@@ -159,12 +150,12 @@ def _first_diagnosis(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
     if len(records) == 1 or found.verdict is Verdict.NONE:
         return 0, found
 
-    def neg2_log_evidence(some: Sequence[Record]) -> float:
+    def score(some: Sequence[Record]) -> float:
         fitted = fit_model(some, prior, some[0].training.effects)
-        return np.inf if fitted is None else fitted.neg2_log_evidence
+        return np.inf if fitted is None else fitted.score
 
-    together = neg2_log_evidence(records)
-    apart = [neg2_log_evidence(records[:k]) + neg2_log_evidence(records[k:]) for k in range(1, len(records))]
+    together = score(records)
+    apart = [score(records[:k]) + score(records[k:]) for k in range(1, len(records))]
     if min(apart) >= together:
         return 0, found
     first = 1 + int(np.argmin(apart))
@@ -176,39 +167,8 @@ def _first_diagnosis(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
 
 
 def _explained(found: Diagnosis) -> float:
-    """Fall of -2 log evidence by all effects added."""
-    return found.base.neg2_log_evidence - found.completed.neg2_log_evidence
-
-
-def diagnose_type(
-    vehicles: Sequence[Sequence[Record]], prior: SoilPrior, catalogue: Sequence[Effect]
-) -> tuple[tuple[SharedEffect, ...], list[VehicleDiagnosis]]:
-    """The effects that vehicles of a type share, and the diagnosis of each vehicle beside them.
-
-    Parameters
-    ----------
-    vehicles
-        The records of each.
-    prior, catalogue
-        As of diagnose_vehicle().
-
-    Raises
-    ------
-    NotFitted
-        Where already the present model cannot be fitted to some vehicle.
-    """
-    found: list[VehicleDiagnosis] = []
-
-    def factors_beside(shared: tuple[SharedEffect, ...]) -> list[Mapping[str, Factor]]:
-        found.clear()
-        for v, records in enumerate(vehicles):
-            for one in shared:
-                records = records_with(records, one.effect, one.given[v])
-            found.append(diagnose_vehicle(records, prior, catalogue))
-        return [each.factors for each in found]
-
-    n_wheels = vehicles[0][0].training.n_wheels
-    return shared_effects({effect.name: effect for effect in catalogue}, n_wheels, factors_beside), found
+    """Fall of the score by all effects added."""
+    return found.base.score - found.completed.score
 
 
 def onsets_of(records: Sequence[Record], prior: SoilPrior, found: Diagnosis) -> dict[str, Onset]:
@@ -235,21 +195,19 @@ def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect, beside
     beside
         Other effects of the model.
     """
-    shown: list[OwnParameters | None] = []
+    shown: list[SizeLikelihood | None] = []
     sizes: list[Mapping[str, Estimate] | None] = []
-    excess = 0.0
     for record in records:
         fitted = fit_model([record], prior, (*record.training.effects, *beside, effect))
-        shown.append(None if fitted is None else fitted.shared_parameters(effect))
+        shown.append(None if fitted is None else fitted.size_likelihood(effect))
         sizes.append(None if fitted is None else fitted.parameters()[effect.name])
-        excess += 0.0 if fitted is None else fitted.excess
     falls = [_fall(shown[k:]) for k in range(len(records))]
-    *probabilities, never = onset_probabilities(falls, temperature(excess))
+    *probabilities, never = onset_probabilities(falls)
     return Onset(int(np.argmax(probabilities)), tuple(probabilities), never, tuple(sizes))
 
 
-def _fall(shown: Sequence[OwnParameters | None]) -> float:
-    """Fall of -2 log evidence by an effect of one size in all of these logs; a fit that failed says nothing.
+def _fall(shown: Sequence[SizeLikelihood | None]) -> float:
+    """Expected fall of the score by an effect of one size in all of these logs; a fit that failed says nothing.
 
     A parameter that some log's fit holds at the edge of its range is left out.
     """
@@ -259,25 +217,23 @@ def _fall(shown: Sequence[OwnParameters | None]) -> float:
         return 0.0
     kept = [[i for i, f in enumerate(each.free) if f.name in common] for each in known]
     information = np.sum([each.information[np.ix_(at, at)] for each, at in zip(known, kept, strict=True)], axis=0)
-    vector = np.sum([each.information_vector[at] for each, at in zip(known, kept, strict=True)], axis=0)
-    return -mixture_neg2_log_evidence(information, vector, [known[0].free[i] for i in kept[0]])
+    vector = np.sum([each.vector[at] for each, at in zip(known, kept, strict=True)], axis=0)
+    return -expected_change(information, vector)
 
 
-def onset_probabilities(falls: Sequence[float], divisor: float) -> list[float]:
+def onset_probabilities(falls: Sequence[float]) -> list[float]:
     """Probability of each log to be the first with an effect, and, last, that none has it.
 
     Parameters
     ----------
     falls
-        Fall of -2 log evidence by an effect that all logs from this one on have.
-    divisor
-        The temperature (see `verdict`).
+        Fall of the score by an effect that all logs from this one on have.
 
     Returns
     -------
     Probabilities; beforehand each case is as likely as any other.
     """
-    return [float(p) for p in softmax(np.array([*falls, 0.0]) / (2.0 * divisor))]
+    return [float(p) for p in softmax(np.array([*falls, 0.0]) / 2.0)]
 
 
 def named(probabilities: Sequence[float], rate: float = FALSE_DISCOVERY_RATE) -> list[bool]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from soilbus.estimation.options import SolverOptions
 
-__all__ = ["DEFAULT", "TYPE_DEFAULT", "DiagnosisOptions", "TypeOptions"]
+__all__ = ["DEFAULT", "DiagnosisOptions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +49,9 @@ class DiagnosisOptions:
     """Linearisations that bring the latents of held-out blocks to their optimum.  With 5 eleven values of the golden
     diagnoses move, with 1 nearly six hundred."""
 
-    max_excess: float = 10000.0
-    """Excess [squared sd] from which on evidence counts no less: without it 4 of 24 blind pairs (seeds 301 to 303)
-    lose their smaller effect."""
-    alpha: float = 400.0
-    """Excess [squared sd] at which evidence counts half as much.  Of 140 blind cases (seeds 211 and 212) names are
-    right about as often as their probability says; with 200 to 2000, and `zeta_0` of 1/3 to 2/3, as many single effects
-    are named first.  Other seeds: service/docs/diagnosis.md."""
-    zeta_0: float = 0.5
-    """How much evidence counts [1] without excess; as `alpha`."""
-    least_gap_share: float = 0.25
-    """Share [1] of a real gap's excess over noise that an effect must explain to be added.  Without it 6 of 18 cases
-    outside the catalogue (seeds 211 and 212) get names beside the verdict `unknown`, with it 2."""
+    dominated_fall: float = 200.0
+    """-2 log posterior [1] above the best candidate's from which a fit is given up: blocks tell two models of that
+    difference apart by three sd, as a half to a third of it is how blocks scatter."""
     max_formula_error: float = 0.1
     """Share [1] of what effects change by which their formulas may be off: a further one must explain more than its
     square of what they explain.  Where that is above 31 000 (seeds 301, 505, 506; 9 pairs, 2 singles) the smaller true
@@ -98,21 +89,5 @@ class DiagnosisOptions:
     """The same of the sum [1]."""
 
 
-@dataclass(frozen=True, slots=True)
-class TypeOptions:
-    """Judgement of what the vehicles of a type share."""
-
-    min_vehicles: int = 3
-    """Vehicles from which on a type is judged: of two that differ, nothing says which one is the type's."""
-    shown_log_evidence: float = 1.0
-    """Log evidence [1], tempered, from which on a vehicle shows an effect: where its logs say nothing of it, that
-    scatters about zero, and with 0 the fault of one vehicle among such is taken for the type's."""
-    left_out_share: float = 1.0 / 32.0
-    """Share [1] of the vehicles that are left out at once, one at least.  It bounds the time: of 1000 vehicles, 20 % of
-    them with a fault of their own, the same are left out one at a time, in twelve times the time."""
-
-
 DEFAULT = DiagnosisOptions()
 """What a recording's diagnosis has unless another is given with it."""
-TYPE_DEFAULT = TypeOptions()
-"""What the judgement of a type has unless another is given."""

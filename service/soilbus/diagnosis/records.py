@@ -2,14 +2,13 @@
 
     fold = floor(t / block) mod folds,  the last fold is held out
 
-Successive instants are correlated, so whole time blocks are held out, in turn with the training blocks.  A table of
+Successive instants are correlated, so whole time blocks are held out.  A table of
 steady states has no time: each third row in the order of slip is held out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -45,12 +44,10 @@ class Record:
     joint_prior
         Posterior of soil, gains and parameters from an earlier fit on the same soil; it replaces the prior of a single
         recording.
-    whole, fold
-        Observation model of all instants, and the fold (N,) of each; None where no other fold can be held out.
+    whole
+        Observation model of all instants; None of a table.
     options
         Of its diagnosis.
-    of_type
-        Names of the model's effects that other vehicles share, and whose sizes these have determined.
     source
         Window, rig, model and limits of speed and turn that it was made of; None of a table.
     noise
@@ -62,11 +59,14 @@ class Record:
     held_out: ObservationModelWithEffects
     joint_prior: Gaussian | None = None
     whole: ObservationModelWithEffects | None = None
-    fold: NDArray[np.intp] | None = None
     options: DiagnosisOptions = DEFAULT
-    of_type: frozenset[str] = frozenset()
     source: tuple[Window, Rig, WheelModel, float, float] | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
+
+    def block_numbers(self, part: ObservationModelWithEffects) -> NDArray[np.intp]:
+        """The block (N,) of each instant of a part of the recording; of a table each row is one."""
+        length = 0.0 if self.source is None else block_length(part.duration, self.options)
+        return np.asarray((part.since / length).astype(int)) if length > 0.0 else np.arange(part.n)
 
     def with_noise(self, factor: Mapping[str, float]) -> Record:
         """The same with the variances of each kind of sensor times a factor; a table as it is."""
@@ -74,10 +74,10 @@ class Record:
             return self
         window, rig, model, min_speed, max_turn = self.source
         scaled = VarianceComponents(rig.options.variance).after(factor, whole=True).scaled(window, rig)
-        effects, free, of_type = self.training.effects, self.training.free, self.of_type
+        effects, free = self.training.effects, self.training.free
         again = record_of(self.name, scaled, rig, model, min_speed, max_turn, self.options)
         again = again.with_effects(effects, free, self.joint_prior)
-        return replace(again, of_type=of_type, source=self.source, noise=factor)
+        return replace(again, source=self.source, noise=factor)
 
     def with_effects(
         self, effects: Sequence[Effect], free: Sequence[Free], joint_prior: Gaussian | None = None
@@ -87,32 +87,17 @@ class Record:
         whole = None if self.whole is None else self.whole.with_effects(effects, free)
         return replace(self, training=training, held_out=held_out, joint_prior=joint_prior, whole=whole)
 
-    def with_held_out(self, fold: int) -> Record | None:
-        """The same with another fold held out; None where that cannot be."""
-        if self.whole is None or self.fold is None:
-            return None
-        training, held_out = (self.whole.part(np.flatnonzero(part)) for part in (self.fold != fold, self.fold == fold))
-        return replace(self, training=training, held_out=held_out)
-
     def with_weights_at(self, training: Linearisation, held_out: Linearisation) -> Record:
         """The same with the weights of a model in which the parts were linearised; see `ObservationModel`."""
         parts = [part.with_weights_at(at) for part, at in ((self.training, training), (self.held_out, held_out))]
-        if self.whole is None or self.fold is None or parts[0].held_covariance is None:
-            return replace(self, training=parts[0], held_out=parts[1])
-        whole, is_held_out = copy(self.whole), self.fold == self.options.folds - 1
-        for name in ("held_covariance", "common_weights"):
-            of_parts = [getattr(part, name) for part in parts]
-            together = np.empty((self.whole.n, *of_parts[0].shape[1:]))
-            together[~is_held_out], together[is_held_out] = of_parts
-            setattr(whole, name, together)
-        return replace(self, training=parts[0], held_out=parts[1], whole=whole)
+        return replace(self, training=parts[0], held_out=parts[1])
 
     def thinned(self, every: int) -> Record:
         """The same with each `every`-th instant; a table of few rows keeps all of them."""
         parts = self.training, self.held_out
         least = self.options.min_sample
         training, held_out = (part.part(slice(None, None, min(every, part.n // least + 1))) for part in parts)
-        return replace(self, training=training, held_out=held_out, whole=None, fold=None)
+        return replace(self, training=training, held_out=held_out, whole=None)
 
 
 def diagnosed(rig: Rig) -> Rig:
@@ -162,7 +147,7 @@ def record_of(
     if not (training.n_rows and held_out.n_rows):
         raise TooLittle(f"{name}: neither a torque nor a draft is known with its load, slip and slope at once")
     source = window, rig, model, min_speed, max_turn
-    return Record(name, training, held_out, whole=problem, fold=fold, options=options, source=source)
+    return Record(name, training, held_out, whole=problem, options=options, source=source)
 
 
 def record_of_rows(
@@ -189,6 +174,10 @@ def record_of_rows(
 
 def folds(since: NDArray[np.float64], options: DiagnosisOptions) -> NDArray[np.intp]:
     """Fold (N,) of instants at these times (N,) [s] since the start: blocks by turns."""
-    span = float(since[-1] - since[0]) if len(since) else 0.0
-    length = min(options.block, span / (3 * options.folds)) if span > 0.0 else options.block
+    length = block_length(float(since[-1] - since[0]) if len(since) else 0.0, options)
     return np.asarray((since / max(length, 1e-9)).astype(int) % options.folds)
+
+
+def block_length(span: float, options: DiagnosisOptions) -> float:
+    """Length [s] of the blocks of a recording of this span [s]: three at least of each fold."""
+    return min(options.block, span / (3 * options.folds)) if span > 0.0 else options.block

@@ -4,7 +4,7 @@
 
 u are the effect's parameters in units of their prior std, c the coordinates of the present model (soil, sensor gains,
 parameters of its effects).  The Schur complement H is the information on u that the present model cannot imitate.
-From H and g follow the fall of -2 log posterior if the effect were added, the change of -2 log evidence, and a start
+From H and g follow the fall of -2 log posterior if the effect were added, the change of the score, and a start
 for the effect's fit (Rao's score test, Bayesian with the prior's precision).
 
 Of several recordings c holds the soil and the own parameters of each, and the gains that all share (`joint_fit`).
@@ -23,7 +23,7 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.optimize import lsq_linear
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
+from soilbus.diagnosis.blocks import expected_change
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.joint_fit import JointModel, JointObjective, Start, own_gains
 from soilbus.diagnosis.records import Record
@@ -38,13 +38,13 @@ from soilbus.terra.effects.effect import Effect
 class Score:
     """Prediction for one effect.
 
-    fall: fall of -2 log posterior; neg2_log_evidence: change of -2 log evidence (negative where the effect explains
+    fall: fall of -2 log posterior; change: of the score of `blocks` (negative where the effect explains
     something); starts: one for each recording, for a fit with the effect.
     """
 
     effect: Effect
     fall: float
-    neg2_log_evidence: float
+    change: float
     starts: tuple[Start, ...]
 
 
@@ -62,7 +62,7 @@ def scores(
     free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
     equations = normal_equations(records, prior, present, candidates, free)
     found = [_score(effect, free, equations) for effect in candidates]
-    return sorted(found, key=lambda score: score.neg2_log_evidence)
+    return sorted(found, key=lambda score: score.change)
 
 
 def further_scores(
@@ -78,7 +78,7 @@ def further_scores(
         by_name = {one.effect.name: one for one in group}
         for score in scores(records, prior, present, [one.shifted for one in by_name.values()]):
             one, best = by_name[score.effect.name], found.get(score.effect.name)
-            if best is None or score.neg2_log_evidence < best.neg2_log_evidence:
+            if best is None or score.change < best.change:
                 starts = tuple(_with_offset(start, one.offsets) for start in score.starts)
                 found[score.effect.name] = replace(score, effect=one.effect, starts=starts)
     return list(found.values())
@@ -219,15 +219,15 @@ def _score(effect: Effect, free: Sequence[Free], equations: NormalEquations) -> 
         of_own = i if effect.of_record else 0
         starts.append(_start(equations, i, parameters, parts[of_own], solutions[of_own].step))
     fall = sum(solution.fall for solution in solutions)
-    return Score(effect, fall, sum(solution.neg2_log_evidence for solution in solutions), tuple(starts))
+    return Score(effect, fall, sum(solution.change for solution in solutions), tuple(starts))
 
 
 class _Minimum(NamedTuple):
-    """Step of the parameters (P,) in prior std, fall of -2 log posterior, and change of -2 log evidence."""
+    """Step of the parameters (P,) in prior std, fall of -2 log posterior, and change of the score."""
 
     step: Array
     fall: float
-    neg2_log_evidence: float
+    change: float
 
 
 def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) -> _Minimum:
@@ -242,14 +242,13 @@ def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) 
     found = lsq_linear(root.T, -solve_triangular(root, gradient, lower=True), (low, high), method="bvls")
     step, inside = found.x, found.active_mask == 0
     fall = float(-2.0 * gradient @ step - step @ information @ step)
+    length = float(step @ step)
     if not inside.any():
-        return _Minimum(step, fall, -fall)
+        return _Minimum(step, fall, -fall - length)
     kept = np.ix_(inside, inside)
     of_data, vector = information[kept] - np.eye(int(inside.sum())), information[kept] @ step[inside]
-    mixture = mixture_neg2_log_evidence(
-        of_data, vector, [f for f, is_inside in zip(free, inside, strict=True) if is_inside]
-    )
-    return _Minimum(step, fall, mixture + float(step[inside] @ vector) - fall)
+    of_inside = step[inside] @ vector + float(step[inside] @ step[inside])  # the fall of -2 log likelihood by them
+    return _Minimum(step, fall, expected_change(of_data, vector) + of_inside - fall - length)
 
 
 def _start(

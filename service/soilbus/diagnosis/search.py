@@ -1,9 +1,9 @@
 """Stepwise search for missing effects, with swaps.
 
-    fall(e) = -2 log p(data | model) + 2 log p(data | model with effect e)
-    add the e of the greatest fall, while it reaches the required fall
+    fall(e) = score of the model - score of the model with effect e                 (`blocks`)
+    add the e of the greatest fall, while it is more probable than none
     after each addition compare every effect with all candidates in its place:
-        swap it where another explains more, remove it where its fall is below the required one
+        swap it where another explains more, remove it where none is more probable
 
 A comparison has three stages.  Score tests name the candidates that can explain something and say where their fits
 begin; each is fitted to a part of the instants, from all its starts; from there those that can still win are fitted
@@ -16,18 +16,13 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.joint_fit import Start
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Score, further_scores, scores
-from soilbus.diagnosis.verdict import (
-    dominated_deficit,
-    mean_soil_error_share,
-    probabilities,
-    required_fall,
-    temperature,
-)
+from soilbus.diagnosis.verdict import mean_soil_error_share, probabilities
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -43,21 +38,23 @@ class Addition:
         The effect, and the probability of its name.
     alternatives
         Probability by name of the other effects that belong to the set.
-    falls
-        Fall of -2 log evidence by name.
+    by_block
+        Fall of the score of each block by name.
     soil_error_share
         Share of the change of the soil's parameters that counts as a standard deviation: root mean square over the
         set, weighted by probability.
-    temperature
-        What the falls are divided by before they become probabilities (see `verdict`).
     """
 
     effect: Effect
     probability: float
     alternatives: dict[str, float]
-    falls: dict[str, float]
+    by_block: dict[str, Array]
     soil_error_share: float = 0.0
-    temperature: float = 1.0
+
+    @property
+    def falls(self) -> dict[str, float]:
+        """Fall of the score by name."""
+        return {name: float(falls.sum()) for name, falls in self.by_block.items()}
 
 
 @dataclass(slots=True)
@@ -74,10 +71,8 @@ class Search:
         Effects that may be missing.
     options
         Of the diagnosis.
-    excess
-        What the recordings leave without effects, see excess_without_effects().
-    temperature
-        See temperature_beside().
+    bare
+        Score without those effects whose sizes are fitted (see score_without_effects()).
     """
 
     full: FitCache
@@ -85,14 +80,11 @@ class Search:
     base: FittedModel
     candidates: Sequence[Effect]
     options: DiagnosisOptions = DEFAULT
-    excess: float = field(init=False)
-    temperature: float = field(init=False)
+    bare: float = field(init=False)
     _compared: dict[frozenset[str], dict[str, FittedModel]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        given = self.full.records, self.full.prior, self.base
-        self.excess = excess_without_effects(*given)
-        self.temperature = temperature_beside(*given, self.options)
+        self.bare = score_without_effects(self.full.records, self.full.prior, self.base)
 
     def steps(self) -> Iterator[tuple[list[Addition], FittedModel]]:
         """After each addition and its swaps: the additions in the order of the model's effects, and the model."""
@@ -102,7 +94,7 @@ class Search:
             if wider is None or self._falls_short(present, wider):
                 return
             found = self.with_swaps(wider)
-            if found.neg2_log_evidence > present.neg2_log_evidence - self.options.negligible_fall:
+            if found.score > present.score - self.options.negligible_fall:
                 return
             present = found
             yield [self.addition(present, effect) for effect in self.added(present)], present
@@ -113,7 +105,7 @@ class Search:
 
     def best(self, model: FittedModel) -> FittedModel | None:
         """The model with the effect more that explains most; None where no candidate explains anything."""
-        return min(self.compared(model).values(), key=lambda fit: fit.neg2_log_evidence, default=None)
+        return min(self.compared(model).values(), key=lambda fit: fit.score, default=None)
 
     def with_swaps(self, model: FittedModel) -> FittedModel:
         """The model with effects swapped or removed until no swap explains more and none falls short."""
@@ -124,8 +116,8 @@ class Search:
                 if without is None:
                     continue
                 other = self.best(without)
-                enough = model.neg2_log_evidence - self.options.negligible_fall
-                if other is not None and other.neg2_log_evidence < enough:
+                enough = model.score - self.options.negligible_fall
+                if other is not None and other.score < enough:
                     better = other
                 elif self._falls_short(without, model):
                     better = without
@@ -142,9 +134,7 @@ class Search:
         """The model with one effect more, by the name of each candidate that explains something."""
         key = frozenset(model.names)
         if key not in self._compared:
-            self._compared[key] = {
-                name: fit for name, fit in self._fits(model) if fit.neg2_log_evidence < model.neg2_log_evidence
-            }
+            self._compared[key] = {name: fit for name, fit in self._fits(model) if fit.score < model.score}
         return self._compared[key]
 
     def addition(self, model: FittedModel, effect: Effect) -> Addition:
@@ -152,19 +142,18 @@ class Search:
         without = self._without(model, effect)
         beside = self.base if without is None else without
         fits = self.compared(beside) | {effect.name: model}
-        falls = {name: beside.neg2_log_evidence - fit.neg2_log_evidence for name, fit in fits.items()}
-        by_name = {e.name: e for e in (effect, *self.candidates)}
-        chances = probabilities(falls, self.temperature, {n: fit.own_parameters(by_name[n]) for n, fit in fits.items()})
+        falls = {name: beside.blocks.neg2_log - fit.blocks.neg2_log for name, fit in fits.items()}
+        chances = probabilities(falls)
         others = {n: p for n, p in chances.items() if n != effect.name and p >= self.options.set_probability}
         in_set = {n: p for n, p in chances.items() if n == effect.name or n in others}
         share = mean_soil_error_share(in_set, self.options)
-        ordered = dict(sorted(falls.items(), key=lambda item: -item[1]))
-        return Addition(effect, chances[effect.name], others, ordered, share, self.temperature)
+        ordered = dict(sorted(falls.items(), key=lambda item: -float(item[1].sum())))
+        return Addition(effect, chances[effect.name], others, ordered, share)
 
     def _fits(self, model: FittedModel) -> Iterator[tuple[str, FittedModel]]:
         """Fits of the candidates to all instants, by name; without those that cannot win."""
         trials: list[tuple[FittedModel, list[Score]]] = []
-        limit, margin = math.inf, dominated_deficit(self.temperature, self.options)
+        limit, margin = math.inf, self.options.dominated_fall
         for of_one in self._by_score(model)[: self.options.max_candidates]:
             effects, starts = (*model.effects, of_one[0].effect), [score.starts for score in of_one]
             trial = self.thinned.fit(effects, starts, replace(self.options.compared, give_up_above=limit))
@@ -177,7 +166,7 @@ class Search:
             fit = self.full.fit(trial.effects, [trial.as_starts()], descent)
             if fit is None:
                 continue
-            promising = [s for s in of_one if model.neg2_log_evidence + s.neg2_log_evidence < fit.neg2_log_evidence]
+            promising = [s for s in of_one if model.score + s.change < fit.score]
             fit = self.full.better(fit, [score.starts for score in promising])
             limit = min(limit, fit.neg2_log_posterior + margin)
             yield of_one[0].effect.name, fit
@@ -189,8 +178,8 @@ class Search:
             return []
         given = self.full.records, self.full.prior, model, possible
         found: dict[str, list[Score]] = {}
-        for score in sorted([*scores(*given), *further_scores(*given)], key=lambda score: score.neg2_log_evidence):
-            if score.neg2_log_evidence < 0.0:
+        for score in sorted([*scores(*given), *further_scores(*given)], key=lambda score: score.change):
+            if score.change < 0.0:
                 found.setdefault(score.effect.name, []).append(score)
         return list(found.values())
 
@@ -202,69 +191,23 @@ class Search:
         return self.full.fit(kept, [[start._replace(near_optimum=False) for start in model.as_starts(kept)]])
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
-        """Whether an effect explains less than the required fall."""
-        required = required_fall_beside(self.full.records, without, self.temperature, self.excess, self.options)
-        return without.neg2_log_evidence - model.neg2_log_evidence < required
+        """Whether an effect is less probable than none, or explains no more than the others' formulas may leave."""
+        fall = without.blocks.neg2_log - model.blocks.neg2_log
+        of_formulas = self.options.max_formula_error**2 * (self.bare - without.score)
+        return probabilities({"it": fall})["it"] < 0.5 or float(fall.sum()) < of_formulas
 
 
-def excess_without_effects(
-    records: Sequence[Record], prior: SoilPrior, present: FittedModel, with_type: bool = False
-) -> float:
-    """Excess E = chi-square - its expectation of the model without those effects whose sizes are fitted.
+def score_without_effects(records: Sequence[Record], prior: SoilPrior, present: FittedModel) -> float:
+    """Return the score of the model without those effects whose sizes are fitted, at least that of the present one.
 
-    Parameters
-    ----------
-    records, prior, present
-        The recordings, the prior of the soil, and the model fitted to them.
-    with_type
-        Whether the effects that other vehicles of the type have determined stay in the model.
-
-    Returns
-    -------
-    E [squared sd], at least that of the present model.
-
-    Notes
-    -----
-    What a fitted effect explains counts as what a search explains, whether a configuration or the type of the vehicle
-    has put it into the model: its formula is not the field's either.
+    What a fitted effect explains counts as what a search explains where a configuration has put it into the model: its
+    formula is not the field's either.
     """
-    if not present.effects:
-        return present.excess
     fitted = {f.effect for f in present.free_unheld if f.std > 0.0}
-    fitted -= records[0].of_type if with_type else frozenset()
     kept = [effect for effect in present.effects if effect.name not in fitted]
     given = [f for f in present.free_unheld if f.effect not in fitted]
     without = fit_model([record.with_effects(kept, given) for record in records], prior, kept) if fitted else None
-    return present.excess if without is None else max(present.excess, without.excess)
-
-
-def temperature_beside(
-    records: Sequence[Record], prior: SoilPrior, present: FittedModel, options: DiagnosisOptions = DEFAULT
-) -> float:
-    """The temperature of recordings under a model, by their excess without effects but for those of the type.
-
-    The other vehicles have determined these: what their formulas leave is alike in all, and no fault of one.
-    """
-    return temperature(excess_without_effects(records, prior, present, with_type=True), options)
-
-
-def required_fall_beside(
-    records: Sequence[Record],
-    model: FittedModel,
-    divisor: float,
-    excess: float,
-    options: DiagnosisOptions = DEFAULT,
-) -> float:
-    """Fall of -2 log evidence from which an effect is added to a model, at a temperature.
-
-    excess: see excess_without_effects().  Where loads left and right are computed all of what the model
-    leaves counts, not only a gap beyond noise: loads shake, wheels slip by it, and a false effect follows a good part
-    of that (a sixth of the excess in drives whose loads shake by 12 %).
-    """
-    left = model.excess if any(record.training.computes_sides for record in records) else None
-    return required_fall(
-        divisor, model.held_out_chi2, model.checked_rows, model.rows, options, left, excess - model.excess
-    )
+    return present.score if without is None else max(present.score, without.score)
 
 
 class FitCache:
@@ -335,4 +278,4 @@ class FitCache:
 
 
 def _better(one: FittedModel | None, other: FittedModel | None) -> FittedModel | None:
-    return one if other is None or (one is not None and one.neg2_log_evidence <= other.neg2_log_evidence) else other
+    return one if other is None or (one is not None and one.neg2_log_posterior <= other.neg2_log_posterior) else other

@@ -127,6 +127,6 @@ def expected_probability(addition: Addition, true: str, gained: dict[str, float]
     """
     names = {addition.effect.name, *addition.alternatives}
     least = min(gain for name, gain in gained.items() if name != true)
-    falls = {name: addition.falls[name] - gained.get(name, least) for name in names}
-    with_all = {name: fall + max(gained.values()) for name, fall in falls.items()}
-    return probabilities(with_all, addition.temperature)[true]
+    most = max(gained.values())
+    further = {name: most - gained.get(name, least) for name in names}  # a block more of the drive's own
+    return probabilities({name: np.append(addition.by_block[name], further[name]) for name in names})[true]

@@ -56,7 +56,7 @@ _BY_INSTANT = (
     "_side_known", "standing_rows", "standing_latents",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
-_BY_INSTANT_IF_ANY = ("held_covariance", "common_weights", "_off_curve")
+_BY_INSTANT_IF_ANY = ("held_covariance", "_off_curve")
 """The same of those that may be None."""
 
 
@@ -183,7 +183,6 @@ class Measurements:
         self._known = known
         self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None
-        self.common_weights: Array | None = None
         self._off_curve: Array | None = None
         self._count()
 

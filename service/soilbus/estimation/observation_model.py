@@ -432,27 +432,7 @@ class ObservationModel(Measurements):
         held = copy(self)
         if self.computes_loads:
             held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
-            row_var = self.variances(np.zeros(len(self.gain_std)))[1]
-            held.common_weights = self.inverse_covariance(at.by_latents, at.variance, row_var)
         return held
-
-    def expected_chi2(self, at: Linearisation, gains: Array) -> float:
-        """Chi-square less what the model misses: the number of rows, or by the sensors' noise where loads are computed.
-
-        With C = S - K, K what computed loads leave open, and weights R that all models share (`with_weights_at`),
-
-            E[r' R r] = tr(R C) + b' R b        b: error of the model
-
-        so that r' S^-1 r less what is returned is r' R r - tr(R C), free of what noise does in this model.
-        """
-        if not self.computes_sides:
-            return float(self.n_rows)
-        K = self._by_load_noise(at.by_latents, at.variance) if self.held_covariance is None else self.held_covariance
-        inverse = self.inverse_covariance(at.by_latents, *self.variances(gains))
-        R = inverse if self.common_weights is None else self.common_weights
-        residual = at.rows[:, RESIDUAL].reshape(inverse.shape[:2])
-        missed = np.einsum("ni,nij,nj->", residual, R, residual) - np.sum(R * (np.linalg.inv(inverse) - K))
-        return float(at.chi2 - missed - np.count_nonzero(~self._known))
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
         """Observations (N, S) of loads left less right after a Newton step to equal torques.

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from soilbus.diagnosis.verdict import Verdict, least_required_fall
+from soilbus.diagnosis.verdict import FALL_OF_NONE, Verdict
 from soilbus.offline.diagnose import Findings
 from soilbus.report.diagnosis_pictures import (
     BINS,
@@ -90,8 +90,7 @@ def _sums(findings: Findings) -> Iterator[tuple[str, Picture]]:
     """Caption and picture of the gaps, and of the largest draft."""
     diagnosis = findings.diagnosis
     gaps = gap_picture(diagnosis.base, diagnosis.completed)
-    loads = " with what computed loads leave open" if diagnosis.gap_before.open_loads > 1.0 else ""
-    yield f"How far each channel is from the model: 1 is as near as the sensors’ noise{loads} allows.", gaps
+    yield "How far each channel is from the model: 1 is as near as the sensors’ noise allows.", gaps
     drafts = draft_picture(findings)
     if drafts is not None:
         yield "Largest steady draft on the level, by the soil of each recording.", drafts
@@ -173,9 +172,14 @@ def _candidates(findings: Findings) -> Iterator[tuple[int, Table, str]]:
             for name, fall in sorted(addition.falls.items(), key=lambda item: -item[1])
         ]
         why = why_probabilities(addition)
-        least = least_required_fall(addition.temperature)
-        words = f"An effect is added from a fall of {least:.0f} on." + (f" {why}." if why else "")
-        yield number, Table(("effect", "fall of -2 log evidence", "probability"), rows, frozenset({1, 2})), words
+        words = f"An effect is added from a fall of {FALL_OF_NONE:.0f} on, where the blocks agree." + (
+            f" {why}." if why else ""
+        )
+        yield (
+            number,
+            Table(("effect", "fall of -2 log predictive likelihood", "probability"), rows, frozenset({1, 2})),
+            words,
+        )
 
 
 def _places(findings: Findings) -> Table | None:

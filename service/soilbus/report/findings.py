@@ -31,7 +31,6 @@ from soilbus.report.statement import (
     same_push,
     shown_lines,
     statement,
-    what_loads_may_do,
     why_probabilities,
 )
 from soilbus.report.table import AT_EDGE, table, value_text
@@ -67,7 +66,6 @@ def findings_record(findings: Findings) -> dict[str, Any]:
             "after": diagnosis.gap_after.value,
             "noise_floor": 1.0,
             "limit": diagnosis.gap_after.limit(),
-            "open_loads": diagnosis.gap_after.open_loads,
             "residuals": diagnosis.gap_after.rows,
             "open": is_open(diagnosis),
         },
@@ -183,10 +181,9 @@ def findings_text(findings: Findings) -> str:
 def gap_line(findings: Findings) -> str:
     """The gap before and after, and that of noise alone."""
     before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
-    loads = f"; {what_loads_may_do(after)}" if after.open_loads > 1.0 else ""
     return (
         f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
-        f"noise alone: 1, hardly ever above {after.limit():.2f}{loads})"
+        f"noise alone: 1, hardly ever above {after.limit():.2f})"
     )
 
 

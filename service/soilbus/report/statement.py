@@ -16,7 +16,6 @@ from soilbus.config.model import Config
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.options import DEFAULT
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict
@@ -42,13 +41,7 @@ def statement(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict is Verdict.UNKNOWN or not is_open(diagnosis):
         return text
     left = "; something is left besides" if names else ""
-    loads = f"; {what_loads_may_do(gap)}" if gap.open_loads > 1.0 else ""
-    return f"{text}{left}: the gap of {gap.value:.2f} is above {gap.limit():.2f}{loads}"
-
-
-def what_loads_may_do(gap: Gap) -> str:
-    """The gap that computed loads may cause."""
-    return f"wheel loads that shake, which no cell measures here, may bring it to {gap.open_loads:.2f}"
+    return f"{text}{left}: the gap of {gap.value:.2f} is above {gap.limit():.2f}"
 
 
 def disagrees(diagnosis: Diagnosis) -> bool:
@@ -201,13 +194,12 @@ def same_push(addition: Addition, completed: FittedModel) -> str | None:
 
 
 def why_probabilities(addition: Addition) -> str | None:
-    """How probabilities follow from the falls of -2 log evidence; None where there is one name only."""
-    if len(addition.falls) < 2:
+    """How probabilities follow from the falls of the score; None where there is one name only."""
+    if len(addition.by_block) < 2:
         return None
     return (
-        "probabilities: no formula of an effect is the field's, and of falls this great such an error may tip the "
-        f"balance; so their differences are divided by {addition.temperature:.0f} before half of each is taken as a "
-        "logarithm of odds"
+        "probabilities: each effect is judged by what it predicts of blocks that it was not fitted to, and a "
+        "probability is the share of random weights of the blocks for which it predicts best"
     )
 
 

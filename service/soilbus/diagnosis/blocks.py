@@ -1,0 +1,148 @@
+"""How well a model predicts each block of a recording from all others.
+
+    s_b = -2 log p(r_b | all other blocks) = r' (I + J P_-b J')^-1 r + log det(I + H_b P_-b)
+
+r and J are the block's residuals and Jacobian, whitened, at the optimum by the other blocks; P_-b is the posterior
+covariance of soil, gains and effects by these, H_b = J'J.  With the quadratic model about the fit nothing is fitted
+again (leave-one-out by one fit: Beirami et al. 2017, NeurIPS 30; blocks, as instants follow each other: Burman, Chow &
+Nolan 1994, Biometrika 81:351).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.arrays import Array
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.observation_model import RESIDUAL, Linearisation
+
+
+class BlockScores(NamedTuple):
+    """Of each block (B,): -2 log predictive likelihood, the chi-square in it, and the number of residuals."""
+
+    neg2_log: Array
+    chi2: Array
+    rows: Array
+
+
+class Part(NamedTuple):
+    """Blocks of one recording, linearised at one point.
+
+    Attributes
+    ----------
+    soil : (6,)
+        Where the model is linearised.
+    gains : (G,)
+        The same of gains and parameters.
+    at
+        Linearisation there.
+    block : (N,)
+        Number of the block of each instant.
+    known : (N, m)
+        Which residuals are measured.
+    """
+
+    soil: Array
+    gains: Array
+    at: Linearisation
+    block: NDArray[np.intp]
+    known: NDArray[np.bool_]
+
+
+def block_scores(
+    records: Sequence[Sequence[Part]],
+    priors: Sequence[Gaussian],
+    modes: Sequence[Gaussian],
+    own: NDArray[np.bool_],
+) -> BlockScores:
+    """Return the scores of all blocks of all recordings, in the order of these.
+
+    Parameters
+    ----------
+    records
+        Parts of each recording.
+    priors
+        Of each recording: of its soil, and its part of that of what all share.
+    modes
+        Soil and gains of each recording, near which its parts are linearised.
+    own : (G,)
+        Which gains and parameters each recording has for itself.
+    """
+    free = np.diag(priors[0].covariance) > 0.0
+    is_own, R = (
+        np.append(np.ones(len(free) - len(own), bool), own)[free] if len(records) > 1 else np.ones(free.sum(), bool),
+        len(records),
+    )
+    n, shared = int(is_own.sum()), int((~is_own).sum())
+    columns = [np.where(is_own, np.cumsum(is_own) - 1 + i * n, np.cumsum(~is_own) - 1 + R * n) for i in range(R)]
+    precision, slope = np.zeros((R * n + shared,) * 2), np.zeros(R * n + shared)
+    blocks = [_blocks(parts, mode, free) for parts, mode in zip(records, modes, strict=True)]
+    for at, prior, mode, (_, gradient, information, _) in zip(columns, priors, modes, blocks, strict=True):
+        of_prior = np.linalg.inv(prior.covariance[np.ix_(free, free)])
+        precision[np.ix_(at, at)] += of_prior + information.sum(0)
+        slope[at] += of_prior @ _steps(prior.soil, prior.gains, mode)[free] + gradient.sum(0)
+    covariance = np.linalg.inv(precision)
+    to_best = -covariance @ slope
+    scores = []
+    for at, (chi2, gradient, information, rows) in zip(columns, blocks, strict=True):
+        P = covariance[np.ix_(at, at)]
+        chi2, gradient = _moved(chi2, gradient, information, to_best[at])
+        left = np.eye(len(P)) - P @ information
+        without = np.linalg.solve(left, np.broadcast_to(P, information.shape))
+        chi2, gradient = _moved(chi2, gradient, information, np.einsum("bij,bj->bi", without, gradient))
+        chi2 = chi2 - np.einsum("bi,ij,bj->b", gradient, P, gradient)
+        scores.append(BlockScores(chi2 - np.linalg.slogdet(left)[1], chi2, rows))
+    return BlockScores(*(np.concatenate(column) for column in zip(*scores, strict=True)))
+
+
+def _blocks(parts: Sequence[Part], mode: Gaussian, free: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+    """Return chi-square, half its gradient and the information of each block at the mode, and its residuals."""
+    normals, steps, rows = [], [], []
+    for part in parts:
+        scale = np.concatenate([np.ones(1), part.soil, np.ones(len(part.gains))])[np.append(True, free)]
+        to_mode = _steps(part.soil, part.gains, mode)[free]
+        by_row = np.repeat(part.block, part.known.shape[1])
+        for number in np.unique(part.block):
+            of_block = by_row == number
+            residuals, weighed = (x[of_block][:, np.append(True, free)] for x in (part.at.rows, part.at.weighed))
+            normals.append(residuals.T @ weighed * np.outer(scale, scale))
+            steps.append(to_mode)
+            rows.append(int(part.known[part.block == number].sum()))
+    N = np.array(normals)
+    information = N[:, 1:, 1:]
+    chi2, gradient = _moved(N[:, RESIDUAL, RESIDUAL], N[:, RESIDUAL, 1:], information, np.array(steps))
+    return chi2, gradient, information, np.array(rows)
+
+
+def _steps(soil: Array, gains: Array, mode: Gaussian) -> Array:
+    """Return the way (6 + G,) to the mode in logarithms of the soil, and in gains."""
+    kept = (soil > 0.0) & (mode.soil > 0.0)  # a parameter that is held at 0
+    return np.append(np.log(np.where(kept, mode.soil, 1.0) / np.where(kept, soil, 1.0)), mode.gains - gains)
+
+
+def expected_change(information: Array, vector: Array) -> float:
+    """Return the change of the sum of scores that a linear effect of parameters (P,) is expected to make.
+
+        -2 b'u + u' H u + 2 tr H (H + I)^-1,    u = (H + I)^-1 b        (Akaike 1974, IEEE Trans. Autom. Control 19:716)
+
+    Parameters
+    ----------
+    information
+        H (P, P): Fisher information of its parameters in units of their prior std, all others eliminated.
+    vector
+        b (P,): gradient of the log likelihood where the effect is absent.
+    """
+    posterior = np.linalg.inv(information + np.eye(len(vector)))
+    u = posterior @ vector
+    return float(u @ information @ u - 2.0 * vector @ u + 2.0 * np.trace(information @ posterior))
+
+
+def _moved(chi2: Array, gradient: Array, information: Array, step: Array) -> tuple[Array, Array]:
+    """Return chi-squares (B,) and half their gradients (B, K) after a step (K,), or one of each block (B, K)."""
+    steps = np.broadcast_to(step, gradient.shape)
+    change = np.einsum("bij,bj->bi", information, steps)
+    return chi2 + np.einsum("bi,bi->b", 2.0 * gradient + change, steps), gradient + change
