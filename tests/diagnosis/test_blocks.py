@@ -51,9 +51,13 @@ def test_each_block_is_predicted_from_all_others_as_by_a_fit_to_these():
 def test_recordings_share_gains_and_have_a_soil_each():
     rng = np.random.default_rng(2)
     (one, block), (two, _) = linear(rng, 4, 6, 2), linear(rng, 4, 6, 2)
-    everything = np.ones(24, bool)
+    first = block < 2
     half = Gaussian(np.ones(SOIL), np.zeros(2), np.diag([1.0] * SOIL + [2.0, 2.0]))  # of two recordings
-    given = [[part_of(rows, block, everything)] for rows in (one, two)], [half, half], [half, half]
+    given = (
+        [(part_of(rows, block, first), part_of(rows, block, ~first)) for rows in (one, two)],
+        [half, half],
+        [half, half],
+    )
     found = block_scores(*given, np.zeros(2, bool))
     J = np.zeros((48, 2 * SOIL + 2))
     J[:24, :SOIL], J[24:, SOIL : 2 * SOIL] = one[:, 1 : 1 + SOIL], two[:, 1 : 1 + SOIL]
@@ -65,6 +69,19 @@ def test_recordings_share_gains_and_have_a_soil_each():
         left = r[own] - J[own] @ covariance @ J[others].T @ r[others]
         predicted = np.eye(6) + J[own] @ covariance @ J[own].T
         assert found.chi2[b] == pytest.approx(left @ np.linalg.solve(predicted, left))
+
+
+def test_the_score_of_a_single_block_is_its_evidence():
+    rng = np.random.default_rng(4)
+    rows, block = linear(rng, 1, 20, 1)
+    prior = Gaussian(np.ones(SOIL), np.zeros(1), np.diag([0.5] * SOIL + [3.0]))
+    first = np.arange(20) < 12
+    found = block_scores(
+        [(part_of(rows, block, first), part_of(rows, block, ~first))], [prior], [prior], np.zeros(1, bool)
+    )
+    covariance = np.eye(20) + rows[:, 1:] @ prior.covariance @ rows[:, 1:].T
+    evidence = rows[:, 0] @ np.linalg.solve(covariance, rows[:, 0]) + np.linalg.slogdet(covariance)[1]
+    assert found.neg2_log == pytest.approx([evidence])
 
 
 def test_an_absent_effect_is_expected_to_cost_what_its_parameters_learn_of_noise():

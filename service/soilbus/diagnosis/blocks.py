@@ -54,7 +54,7 @@ class Part(NamedTuple):
 
 
 def block_scores(
-    records: Sequence[Sequence[Part]],
+    records: Sequence[tuple[Part, Part]],
     priors: Sequence[Gaussian],
     modes: Sequence[Gaussian],
     own: NDArray[np.bool_],
@@ -99,23 +99,24 @@ def block_scores(
     return BlockScores(*(np.concatenate(column) for column in zip(*scores, strict=True)))
 
 
-def _blocks(parts: Sequence[Part], mode: Gaussian, free: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+def _blocks(parts: tuple[Part, Part], mode: Gaussian, free: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
     """Return chi-square, half its gradient and the information of each block at the mode, and its residuals."""
-    normals, steps, rows = [], [], []
-    for part in parts:
-        scale = np.concatenate([np.ones(1), part.soil, np.ones(len(part.gains))])[np.append(True, free)]
-        to_mode = _steps(part.soil, part.gains, mode)[free]
-        by_row = np.repeat(part.block, part.known.shape[1])
-        for number in np.unique(part.block):
-            of_block = by_row == number
-            residuals, weighed = (x[of_block][:, np.append(True, free)] for x in (part.at.rows, part.at.weighed))
-            normals.append(residuals.T @ weighed * np.outer(scale, scale))
-            steps.append(to_mode)
-            rows.append(int(part.known[part.block == number].sum()))
-    N = np.array(normals)
-    information = N[:, 1:, 1:]
-    chi2, gradient = _moved(N[:, RESIDUAL, RESIDUAL], N[:, RESIDUAL, 1:], information, np.array(steps))
-    return chi2, gradient, information, np.array(rows)
+    numbers, inverse = np.unique(np.concatenate([part.block for part in parts]), return_inverse=True)
+    B, K = len(numbers), int(free.sum())
+    chi2, gradient, information, rows = np.zeros(B), np.zeros((B, K)), np.zeros((B, K, K)), np.zeros(B)
+    for part, of_part in zip(parts, np.split(inverse, [len(parts[0].block)]), strict=True):
+        columns = np.append(True, free)
+        scale = np.concatenate([np.ones(1), part.soil, np.ones(len(part.gains))])[columns]
+        to_mode, by_row = _steps(part.soil, part.gains, mode)[free], np.repeat(of_part, part.known.shape[1])
+        for b in np.unique(of_part):
+            residuals, weighed = (x[by_row == b][:, columns] for x in (part.at.rows, part.at.weighed))
+            normal = residuals.T @ weighed * np.outer(scale, scale)
+            change = normal[1:, 1:] @ to_mode
+            chi2[b] += normal[RESIDUAL, RESIDUAL] + (2.0 * normal[RESIDUAL, 1:] + change) @ to_mode
+            gradient[b] += normal[RESIDUAL, 1:] + change
+            information[b] += normal[1:, 1:]
+            rows[b] += part.known[of_part == b].sum()
+    return chi2, gradient, information, rows
 
 
 def _steps(soil: Array, gains: Array, mode: Gaussian) -> Array:
@@ -143,6 +144,5 @@ def expected_change(information: Array, vector: Array) -> float:
 
 def _moved(chi2: Array, gradient: Array, information: Array, step: Array) -> tuple[Array, Array]:
     """Return chi-squares (B,) and half their gradients (B, K) after a step (K,), or one of each block (B, K)."""
-    steps = np.broadcast_to(step, gradient.shape)
-    change = np.einsum("bij,bj->bi", information, steps)
-    return chi2 + np.einsum("bi,bi->b", 2.0 * gradient + change, steps), gradient + change
+    change = (information @ np.broadcast_to(step, gradient.shape)[:, :, None])[:, :, 0]
+    return chi2 + ((2.0 * gradient + change) * step).sum(1), gradient + change

@@ -346,8 +346,8 @@ def _parts(
     """The training blocks and the held-out blocks of a recording, linearised where it was fitted."""
     problem, number, end, mode = held_out.problem, record.block_numbers, fit.optimum, fit.mode
     return (
-        Part(end.soil, end.gains, end.at, number(training), training.known),
-        Part(mode.soil, mode.gains, held_out.at, number(problem), problem.known),
+        Part(end.soil, end.gains, end.at, number(training, False), training.known),
+        Part(mode.soil, mode.gains, held_out.at, number(problem, True), problem.known),
     )
 
 

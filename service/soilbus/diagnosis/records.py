@@ -63,10 +63,11 @@ class Record:
     source: tuple[Window, Rig, WheelModel, float, float] | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
 
-    def block_numbers(self, part: ObservationModelWithEffects) -> NDArray[np.intp]:
-        """The block (N,) of each instant of a part of the recording; of a table each row is one."""
-        length = 0.0 if self.source is None else block_length(part.duration, self.options)
-        return np.asarray((part.since / length).astype(int)) if length > 0.0 else np.arange(part.n)
+    def block_numbers(self, part: ObservationModelWithEffects, held_out: bool) -> NDArray[np.intp]:
+        """The block (N,) of each instant of a part; a table is two, as a row is no more like its neighbours."""
+        if self.source is None:
+            return np.full(part.n, int(held_out))
+        return np.asarray((part.since / block_length(part.duration, self.options)).astype(int))
 
     def with_noise(self, factor: Mapping[str, float]) -> Record:
         """The same with the variances of each kind of sensor times a factor; a table as it is."""
