@@ -7,8 +7,7 @@ Evenly driven recordings determine the sum d + tau well and its parts hardly: th
 with tau^2.  The likelihood is a curved ridge, of which a Gaussian at the top is too wide where tau is 0 and too narrow
 elsewhere.  So -2 log posterior, minimised over soil, gains and other effects (in which it is taken as quadratic about
 the fit), is followed along the ridge and integrated numerically about it: curves through samples make it uneven over
-a sample time, so that its local curvature says little.  It is divided by the temperature T of `verdict`: interpolating
-measurements leaves bias and noise that are not the model's, and a delay shares them with a low pass.
+a sample time, so that its local curvature says little.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import inverse_covariance
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
-from soilbus.terra.effects.effect import Late
+from soilbus.terra.effects.effect import Effect, Late
 
 Cost = Callable[[float, float], float]
 """-2 log posterior of dead time [s] and time constant [s]."""
@@ -77,6 +76,18 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
             (name, late.total): posterior.total,
         }
     return replace(fitted, reported=reported)
+
+
+def total_delays(fitted: FittedModel, effect: Effect) -> dict[str, Estimate]:
+    """Return dead time and time constant together [s] of each channel that an effect delays, by the Gaussian fit."""
+    mode, first = fitted.fits[-1].mode, fitted.checks[-1].problem.n_sensors
+    totals = {}
+    for quantity, names in effect.late.items():
+        own = [i for i, f in enumerate(fitted.free) if f.effect == effect.name and f.parameter.name in names]
+        value = sum(fitted.free[i].at(float(mode.gains[first + i])) for i in own)
+        std, at = np.array([fitted.free[i].std for i in own]), _SOIL + first + np.array(own)
+        totals[quantity] = Estimate(value, float(np.sqrt(std @ mode.covariance[np.ix_(at, at)] @ std)))
+    return totals
 
 
 def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior]) -> list[Start]:

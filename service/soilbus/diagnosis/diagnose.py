@@ -141,7 +141,8 @@ def diagnose(
         raise NotFitted("the present model does not converge on these recordings")
     thinned = FitCache([record.thinned(options.thinning) for record in records], prior, options)
     law = records[0].training.model.shear_law
-    candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
+    of_law = [effect for effect in catalogue if effect.base_law in (None, law)]
+    candidates = [effect for effect in (of_vehicle(effect, records) for effect in of_law) if effect.parameters]
     where, present = disagreements(records, base), base
     additions: list[Addition] = []
     progress("looking for effects")
@@ -231,6 +232,14 @@ def shares_alone(
 
 
 def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:
-    """The effect as it can be on the vehicle of these recordings: beside a pitch sensor a slope is measured."""
+    """The effect as it can be seen in these recordings.
+
+    Beside a pitch sensor a slope is measured.  A channel that does not move shows no delay: one would only smooth its
+    noise.
+    """
+    if effect.late:
+        late = {q: names for q, names in effect.late.items() if any(record.training.moves(q) for record in records)}
+        kept = {name for names in late.values() for name in names}
+        return replace(effect, late=late, parameters=tuple(p for p in effect.parameters if p.name in kept))
     with_pitch = all(record.training.with_pitch for record in records)
     return GRADE_BESIDE_PITCH if with_pitch and effect is GRADE else effect

@@ -87,6 +87,9 @@ class DiagnosisOptions:
     """
     error_of_sum: float = 0.02
     """The same of the sum [1]."""
+    delay_sure_sd: float = 3.0
+    """Deviations by which a delay exceeds a sample time to be a name: of a thousand sound channels one does by noise.
+    """
 
 
 DEFAULT = DiagnosisOptions()

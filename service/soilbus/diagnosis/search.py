@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from soilbus.arrays import Array
+from soilbus.diagnosis.delays import total_delays
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.joint_fit import Start
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
@@ -134,7 +135,11 @@ class Search:
         """The model with one effect more, by the name of each candidate that explains something."""
         key = frozenset(model.names)
         if key not in self._compared:
-            self._compared[key] = {name: fit for name, fit in self._fits(model) if fit.score < model.score}
+            self._compared[key] = {
+                name: fit
+                for name, fit in self._fits(model)
+                if fit.score < model.score and not self._is_within_a_cycle(fit)
+            }
         return self._compared[key]
 
     def addition(self, model: FittedModel, effect: Effect) -> Addition:
@@ -189,6 +194,14 @@ class Search:
         if len(kept) == len(self.base.effects):
             return self.base
         return self.full.fit(kept, [[start._replace(near_optimum=False) for start in model.as_starts(kept)]])
+
+    def _is_within_a_cycle(self, model: FittedModel) -> bool:
+        """Whether the last effect delays no channel by more than its sample time, for sure: stamps do that."""
+        effect, record = model.effects[-1], self.full.records[-1]
+        return bool(effect.late) and not any(
+            abs(total.value) - self.options.delay_sure_sd * total.std > record.training.sample_time(quantity)
+            for quantity, total in total_delays(model, effect).items()
+        )
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:
         """Whether an effect is less probable than none, or explains no more than the others' formulas may leave."""

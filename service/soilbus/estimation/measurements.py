@@ -410,6 +410,14 @@ class Measurements:
         curves = self._curves.window.curves
         return max((curves[name].smooth.step for name in names if name in curves), default=0.0)
 
+    def moves(self, quantity: str) -> bool:
+        """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""
+        if getattr(self._curves.window, quantity).size == 0:
+            return False
+        samples = [value[np.isfinite(value)] for value in np.atleast_2d(getattr(self._curves.window, quantity).T)]
+        off = [value - value.mean() for value in samples if len(value) > 2]
+        return any(float(one[1:] @ one[:-1]) > 0.5 * float(one @ one) for one in off)
+
     def part(self, instants: slice | NDArray[np.intp]) -> Self:
         """The same with the given instants only."""
         part = copy(self)
