@@ -197,9 +197,10 @@ class Search:
 
     def _is_within_a_cycle(self, model: FittedModel) -> bool:
         """Whether the last effect delays no channel by more than its sample time, for sure: stamps do that."""
-        effect, record = model.effects[-1], self.full.records[-1]
+        effect = model.effects[-1]
         return bool(effect.late) and not any(
-            abs(total.value) - self.options.delay_sure_sd * total.std > record.training.sample_time(quantity)
+            abs(total.value) - self.options.delay_sure_sd * total.std
+            > self.full.records[-1].training.sample_time(quantity)
             for quantity, total in total_delays(model, effect).items()
         )
 

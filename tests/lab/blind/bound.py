@@ -8,14 +8,16 @@ expected fall of -2 log likelihood from no effect to the true effect at its true
 
 from __future__ import annotations
 
+import math
+
 from soilbus.diagnosis.search import FitCache
-from soilbus.diagnosis.verdict import FALL_OF_NONE
 from soilbus.estimation.assembly import prior_of
 from soilbus.offline.manoeuvre import record_of_recording
+from soilbus.terra.effects.catalogue import CATALOGUE
 from tests.lab.blind.cases import Case
 from tests.lab.blind.visible import driven_without_noise
 
-LEAST = FALL_OF_NONE
+LEAST = 2.0 * math.log(len(CATALOGUE))
 """E below which no effect is named: the fall from which an effect is more probable than none."""
 
 
