@@ -197,16 +197,6 @@ MUTATIONS = (
         ("tests/test_traversability.py::test_the_margin_counts_for_pulling_only",),
     ),
     Mutation(
-        "peaks are forgotten at once", "decision/immobilisation.py",
-        "return Peaks(t, value, self.now)", "return Peaks(t, value, value)",
-        ("tests/capability/test_trend.py::test_peaks_are_those_of_the_last_seconds",),
-    ),
-    Mutation(
-        "peaks are never forgotten", "decision/immobilisation.py",
-        "return Peaks(t, value, self.now)", "return Peaks(t, value, self.greatest)",
-        ("tests/capability/test_trend.py::test_peaks_are_those_of_the_last_seconds",),
-    ),
-    Mutation(
         "PDU format 240 has a destination", "can/j1939.py",
         "< _PDU2 else", "<= _PDU2 else",
         ("tests/can/test_j1939.py",),
