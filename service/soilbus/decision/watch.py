@@ -263,7 +263,7 @@ def left_by(
     most, std = float(ahead[0]), _std_of_most(curve)
     if slip >= slips[-1]:
         return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
-    if most <= 0.0:
+    if most <= options.significant_sd * std:  # it may be none at all: nothing to compare with
         return now
     within = rows[:, 1]
     reserve = ahead[np.searchsorted(slips, within, "right")] - np.interp(within, slips, pulls)
