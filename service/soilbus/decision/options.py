@@ -44,7 +44,7 @@ class WatchOptions:
     lost_ratio: float = 4.0
     """A fall is extrapolated over at most so many times what is lost already.  Without this limit the start of each
     furrow warned (`e-plough-loam` of the dynamic drives)."""
-    form_error: float = 0.2
+    form_error: float = 0.3
     """Least relative error of the curve's steepness at small slips: what its std does not say."""
     check_lag: float = 2.0
     """Time [s] after which an extrapolated demand is compared with what came."""
@@ -64,7 +64,7 @@ class WatchOptions:
     slips: float = 0.7
     """Share of `traversability.max_slip` above which wheels slip much.  Ordinary drafts of the dynamic drives stay
     below 0.44 for any second, swept ones of the simulator below 0.40."""
-    near: float = 0.15
+    near: float = 0.2
     """What the demand then leaves, as a share: ordinary drafts leave 0.2 and more."""
     kept_share: float = 0.85
     """Share that a demand must fall below for a warning to end."""

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.decision.options import WATCH, WatchOptions
 
-__all__ = ["Line", "LocalTrend"]
+__all__ = ["Extrapolation", "Line", "LocalTrend"]
 
 FIRST_RATE_STD = 1.0
 """Sd of a rate [1/s, m/s^2] before any sample: no vehicle brakes harder than it slides."""
@@ -86,3 +87,44 @@ class Line(NamedTuple):
         spread = float(weight @ (x - t) ** 2) / total
         slope = float((weight * (x - t)) @ y) / total / spread if spread > 1e-9 else 0.0
         return cls(mean - slope * t, slope, spread)
+
+
+class Extrapolation(NamedTuple):
+    """A line that is carried on, and how far earlier ones have missed what came.
+
+    Attributes
+    ----------
+    line
+        The present one.
+    foreseen
+        Times [s] of earlier lines, and their values `check_lag` later.
+    error, checks
+        Sum of squares of what came less that, and their number, both with exponential forgetting.
+    """
+
+    line: Line = Line(math.nan, 0.0, 0.0)
+    foreseen: tuple[tuple[float, float], ...] = ()
+    error: float = 0.0
+    checks: float = 0.0
+
+    def after(self, t: float, step: float, line: Line, age: float, options: WatchOptions = WATCH) -> Extrapolation:
+        """Return the state after one more line; step: since the last one, age: of the first of its values [s]."""
+        error, checks, lag = self.error, self.checks, options.check_lag
+        past = [there for there in self.foreseen if t - there[0] >= lag - 0.5 * step]
+        if past and age >= lag + options.settling_time:
+            kept = math.exp(-step / options.check_memory)
+            error, checks = kept * error + (line.value - past[-1][1]) ** 2, kept * checks + 1.0
+        foreseen = (*self.foreseen[max(len(past) - 1, 0) :], (t, line.value + lag * line.slope))
+        return Extrapolation(line, foreseen, error, checks)
+
+    def probability_above(self, level: float, std: float, options: WatchOptions = WATCH) -> float:
+        """Probability that the line passes a level of this sd within `warning_time`; 0 where it does not rise."""
+        if not self.checks > 0.0 or self.line.slope <= 0.0:
+            return 0.0
+        error = math.sqrt(self.error / self.checks) * options.warning_time / options.check_lag
+        spare = level - self.line.value - options.warning_time * self.line.slope
+        return 0.5 * math.erfc(spare / (math.sqrt(2.0) * math.hypot(error, std, 1e-9)))
+
+    def time_to(self, level: float) -> float:
+        """Time [s] until a line that rises reaches a level."""
+        return max(level - self.line.value, 0.0) / self.line.slope

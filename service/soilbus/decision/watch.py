@@ -32,7 +32,7 @@ from soilbus.config.model import Config, Traversability
 from soilbus.config.model import Warning as Settings
 from soilbus.decision.moments import Moment, Sample
 from soilbus.decision.options import WATCH, WatchOptions
-from soilbus.decision.trends import Line, LocalTrend
+from soilbus.decision.trends import Extrapolation, Line, LocalTrend
 from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 
 if TYPE_CHECKING:
@@ -210,12 +210,10 @@ class Margin(NamedTuple):
         (N, 4): time [s], common slip, pull given [N], demand of draft and slope [N] of the last moments.
     since
         [s], of the first moment without a gap.
-    foreseen
-        Times [s] at which the demand was extrapolated, and what it was to be `check_lag` later [N].
-    error, checks
-        Sum of squares of what came less that [N^2], and their number, both with exponential forgetting.
-    lasts, falls
-        [s], for how long the demand has outgrown the ground, and the ground weakened.
+    demand, slip
+        Lines through the demand [N] and the common slip.
+    lasts, creeps, falls
+        [s], for how long the demand has outgrown the ground, slip has led beyond its limit, and the ground weakened.
     share
         Demand as a share of the capacity.
     cause
@@ -226,10 +224,10 @@ class Margin(NamedTuple):
 
     rows: Array = np.empty((0, 4))
     since: float = math.inf
-    foreseen: tuple[tuple[float, float], ...] = ()
-    error: float = 0.0
-    checks: float = 0.0
+    demand: Extrapolation = Extrapolation()
+    slip: Extrapolation = Extrapolation()
     lasts: float = 0.0
+    creeps: float = 0.0
     falls: float = 0.0
     share: float = 0.0
     cause: str = ""
@@ -247,17 +245,19 @@ def left_by(
         before = Margin(since=t)
     step = t - last if len(before.rows) else 0.0
     rows = np.vstack([before.rows[before.rows[:, 0] > t - options.memory], row])
-    x = rows[:, 0] - t
-    demand = Line.through(x, rows[:, 3], options.slow_memory)
-    error, checks = before.error, before.checks
-    past = [there for there in before.foreseen if t - there[0] >= options.check_lag - 0.5 * step]
-    age = t - before.since
-    if past and age >= options.check_lag + options.settling_time:
-        kept = math.exp(-step / options.check_memory)
-        error, checks = kept * error + (demand.value - past[-1][1]) ** 2, kept * checks + 1.0
-    foreseen = (*before.foreseen[max(len(past) - 1, 0) :], (t, demand.value + options.check_lag * demand.slope))
-    now = Margin(rows, before.since, foreseen, error, checks)
-    if curve is None or age < options.settling_time:
+    x, age = rows[:, 0] - t, t - before.since
+    demand, creep = (
+        was.after(t, step, Line.through(x, rows[:, i], options.slow_memory), age, options)
+        for was, i in ((before.demand, 3), (before.slip, 1))
+    )
+    now = Margin(rows, before.since, demand, creep)
+    if age < options.settling_time:
+        return now
+    works = age >= options.check_least and slip > options.least_slip
+    leads = works and creep.probability_above(max_slip, 0.0, options) > options.outgrows
+    left = creep.time_to(max_slip) if leads else math.inf
+    now = _seen(now, "creeps", leads, before.creeps + step, left, "slip is to pass its limit", options.lasting)
+    if curve is None:
         return now
     slips, pulls, ahead = _known_pulls(curve)
     most, std = float(ahead[0]), _std_of_most(curve)
@@ -266,32 +266,37 @@ def left_by(
     if most <= options.significant_sd * std:  # it may be none at all: nothing to compare with
         return now
     within = rows[:, 1]
+    shortly, near = x > -options.lasting - 0.5 * step, (1.0 - max(options.near, std / most)) * most
+    if float(within[shortly].min()) > options.slips * max_slip and float(rows[shortly, 3].min()) > near:
+        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} % and draft stays", time_left=0.0)
     reserve = ahead[np.searchsorted(slips, within, "right")] - np.interp(within, slips, pulls)
     capacity = np.where(within >= slips[0], rows[:, 2] + reserve, np.nan)
-    second = x > -1.0
-    near = (1.0 - max(options.near, std / most)) * most
-    if float(within[second].min()) > options.slips * max_slip and float(rows[second, 3].min()) > near:
-        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} % for a second", time_left=0.0)
     lately = x > -options.slow_memory
     if 2 * np.count_nonzero(np.isfinite(capacity[lately])) <= np.count_nonzero(lately):
         return now
     slow, fast = (Line.through(x, capacity, memory) for memory in (options.slow_memory, options.fast_memory))
-    limit = min(slow.value, most)
-    outgrown = _time_to_outgrow(now, demand, slip, limit, min(std, options.widest * most), options)
+    limit, width = min(slow.value, most), min(std, options.widest * most)
+    works = works and demand.line.value > options.least_share * limit
+    leads = works and demand.probability_above(limit - width, width, options) > options.outgrows
+    left = demand.time_to(limit) if leads else math.inf
+    now = _seen(now, "lasts", leads, before.lasts + step, left, "draft and slope are to outgrow it", options.lasting)
     peak = float(rows[:, 3].max())
-    weak = min(
+    left, falls = min(
         _time_to_weaken(line, memory, x, capacity, reserve, peak, (most, std / most), options)
         for line, memory in ((slow, options.slow_memory), (fast, options.fast_memory))
     )
-    lasts = before.lasts + step if math.isfinite(outgrown) else 0.0
-    falls = before.falls + step if math.isfinite(weak) else 0.0
-    cause = f"draft and slope are to outgrow the ground in {outgrown:.0f} s" if lasts >= options.lasting else ""
-    cause = f"the ground is to give less than is asked in {weak:.0f} s" if falls >= options.lasting_fall else cause
-    share = demand.value / limit if limit > 0.0 else 1.0
-    left = min(outgrown, weak)
-    return now._replace(
-        lasts=lasts, falls=falls, share=share, cause=cause, time_left=left if math.isfinite(left) else None
-    )  # fmt: skip
+    now = _seen(now, "falls", falls, before.falls + step, left, "the ground is to give less than is asked", options.lasting_fall)
+    return now._replace(share=demand.line.value / limit if limit > 0.0 else 1.0)
+
+
+def _seen(
+    now: Margin, clock: str, holds: bool, since: float, left: float, cause: str, least: float
+) -> Margin:  # fmt: skip
+    """Return the margin after one more look at a cause: since when it holds [s], and the time [s] that it leaves."""
+    now = now._replace(**{clock: since if holds else 0.0})
+    if math.isfinite(left):
+        now = now._replace(time_left=left if now.time_left is None else min(left, now.time_left))
+    return now._replace(cause=f"{cause} in {left:.0f} s") if holds and since >= least else now
 
 
 @lru_cache(maxsize=2)
@@ -308,25 +313,11 @@ def _std_of_most(curve: OverSlip) -> float:
     return float(curve.pull_std[int(np.nanargmax(curve.pull))])
 
 
-def _time_to_outgrow(
-    now: Margin, demand: Line, slip: float, limit: float, std: float, options: WatchOptions
-) -> float:  # fmt: skip
-    """Time [s] until a demand surely outgrows a limit [N]; inf without a rise, or while its swings are not known."""
-    known = now.checks > 0.0 and float(now.rows[-1, 0]) - now.since >= options.check_least
-    worked = slip > options.least_slip and demand.value > options.least_share * limit
-    if not known or not worked or demand.slope <= 0.0:
-        return math.inf
-    error = math.sqrt(now.error / now.checks) * options.warning_time / options.check_lag
-    spare = limit - std - demand.value - options.warning_time * demand.slope
-    above = 0.5 * math.erfc(spare / (math.sqrt(2.0) * math.hypot(error, std, 1e-9)))
-    return max(limit - demand.value, 0.0) / demand.slope if above > options.outgrows else math.inf
-
-
 def _time_to_weaken(
     line: Line, memory: float, x: Array, capacity: Array, reserve: Array, peak: float, most: tuple[float, float],
     options: WatchOptions,
-) -> float:  # fmt: skip
-    """Time [s] until the capacity falls to the greatest demand [N]; inf where it does not surely fall.
+) -> tuple[float, bool]:  # fmt: skip
+    """Time [s] until the capacity falls to the greatest demand [N], inf where it does not surely fall; whether to warn.
 
     line: through the capacity, with this memory [s]; most: largest pull [N] and its relative sd.
 
@@ -337,26 +328,24 @@ def _time_to_weaken(
     wheels are relieved.
     """
     if line.slope >= 0.0 or line.spread <= 0.0:
-        return math.inf
+        return math.inf, False
     before = capacity[np.searchsorted(x, x - options.scatter_lag - 1e-6)]
     changes = (capacity - before)[x > x[0] + options.scatter_lag]
     changes = changes[np.isfinite(changes)]
     if len(changes) < 4:
-        return math.inf
+        return math.inf, False
     scatter = float(changes @ changes) / len(changes) / 2.0
     if -line.slope < options.significant_sd * math.sqrt(options.scatter_lag / memory * scatter / line.spread):
-        return math.inf
+        return math.inf, False
     largest, relative = most
     predicted = -Line.through(x, np.where(np.isfinite(capacity), reserve, np.nan), memory).slope
     given = line.slope + predicted
     error = max(options.significant_sd * relative, options.form_error)
     if predicted < 0.0 or (predicted > 0.0 and given > 0.0 and math.log(predicted / given) < error):
-        return math.inf
+        return math.inf, False
     usual = min(float(np.nanquantile(capacity, 0.8)), (1.0 + relative) * largest)
-    if line.value - peak > options.lost_ratio * (usual - line.value):
-        return math.inf
-    left = max(line.value - peak, 0.0) / -line.slope
-    return left if left < options.warning_time else math.inf
+    lost, left = usual - line.value, max(line.value - peak, 0.0) / -line.slope
+    return left, left < options.warning_time and line.value - peak <= options.lost_ratio * lost
 
 
 class Watch(NamedTuple):
