@@ -34,6 +34,7 @@ from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
 from soilbus.decision.judgement import Basis, at_present
+from soilbus.decision.options import WATCH
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.watch import Alert, Watch, ended, seen_at, watched
 from soilbus.pipeline.corrections import NO_CORRECTIONS
@@ -62,8 +63,6 @@ UNDISTURBED_TIME, UNDISTURBED_TIME_LARGE_BUFFER = 0.04, 0.08
 """Time [s] for which frames stay with the kernel after the worker got a window: loop and worker share one interpreter,
 and each frame taken halts the worker. The second one where the kernel's buffer holds seconds of frames; its default
 holds 75 ms of a full bus."""
-MAX_CURVE_AGE = 60.0
-"""Age [s] up to which a valid window's pull over slip is used to watch for immobilisation."""
 FOREIGN_SENDER_HOLD_TIME = 3.0
 """Time [s] for which a second sender of our frames or of an input is reported, so that every reader sees it."""
 
@@ -441,7 +440,7 @@ class Service:
     def _present_curve(self, now: float) -> OverSlip | None:
         """Pull over slip of the last window that had one, while it is young enough to extrapolate from."""
         known, t = self._curve
-        return known if self._time.at(now) - t < MAX_CURVE_AGE else None
+        return known if self._time.at(now) - t < WATCH.curve_age else None
 
     def _age(self, now: float) -> float:
         """Of the data that the decision rests on [s]."""

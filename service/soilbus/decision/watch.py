@@ -6,12 +6,13 @@
     stops          P(q + h dq/dt > -ln(1 - s_max)) or P(V + h dV/dt < 0) > p while thrust holds, q = -ln(1 - s)
     weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q: the ground gives less than its curve
     outgrows       P(Q + h dQ/dt > C) > p, by the errors of earlier such extrapolations and the curve's width
+    creeps         P(s + h ds/dt > s_max) > p, by the same errors of slip
     slips          slip beyond 0.7 s_max while the demand takes all but the curve's width
 
 P: pull given, P_hat: pull over slip of the last window (Kalman filter and regressions with exponential forgetting).
-The first three need no soil: a local linear trend follows q, V and sinkage, and how much slip shakes widens it.  The
-others need the curve and some seconds of moments, which are kept and seen along the newest curve: so a new window is no
-new ground.  Slip that grows as the draft does is the draft's, not the ground's.
+The first three need no soil: a local linear trend follows q, V and sinkage, and how much slip shakes widens it.  Nor
+does slip that creeps.  The others need the curve and some seconds of moments, which are kept and seen along the newest
+curve: so a new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.
 
 Spinning or stalling for `spin_time` overrules a go of the estimate; without any way for `stuck_time` the vehicle is
 stuck, until it has moved.
@@ -212,8 +213,8 @@ class Margin(NamedTuple):
         [s], of the first moment without a gap.
     demand, slip
         Lines through the demand [N] and the common slip.
-    lasts, creeps, falls
-        [s], for how long the demand has outgrown the ground, slip has led beyond its limit, and the ground weakened.
+    lasts
+        [s], for how long slip has led beyond its limit, the demand has outgrown the ground, and the ground weakened.
     share
         Demand as a share of the capacity.
     cause
@@ -226,9 +227,7 @@ class Margin(NamedTuple):
     since: float = math.inf
     demand: Extrapolation = Extrapolation()
     slip: Extrapolation = Extrapolation()
-    lasts: float = 0.0
-    creeps: float = 0.0
-    falls: float = 0.0
+    lasts: tuple[float, ...] = (0.0, 0.0, 0.0)
     share: float = 0.0
     cause: str = ""
     time_left: float | None = None
@@ -256,19 +255,21 @@ def left_by(
     works = age >= options.check_least and slip > options.least_slip
     leads = works and creep.probability_above(max_slip, 0.0, options) > options.outgrows
     left = creep.time_to(max_slip) if leads else math.inf
-    now = _seen(now, "creeps", leads, before.creeps + step, left, "slip is to pass its limit", options.lasting)
+    lasts = [so_far + step for so_far in before.lasts]
+    now = _seen(now, 0, lasts[0] if leads else 0.0, left, "slip is to pass its limit", options.lasting)
     if curve is None:
         return now
     slips, pulls, ahead = _known_pulls(curve)
     most, std = float(ahead[0]), _std_of_most(curve)
     if slip >= slips[-1]:
         return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
-    if most <= options.significant_sd * std:  # it may be none at all: nothing to compare with
+    if most <= 0.0:
         return now
+    compares = std < options.unknown * most
     within = rows[:, 1]
     shortly, near = x > -options.lasting - 0.5 * step, (1.0 - max(options.near, std / most)) * most
-    if float(within[shortly].min()) > options.slips * max_slip and float(rows[shortly, 3].min()) > near:
-        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} % and draft stays", time_left=0.0)
+    if compares and float(within[shortly].min()) > options.slips * max_slip and float(rows[shortly, 3].min()) > near:
+        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} % under this draft", time_left=0.0)
     reserve = ahead[np.searchsorted(slips, within, "right")] - np.interp(within, slips, pulls)
     capacity = np.where(within >= slips[0], rows[:, 2] + reserve, np.nan)
     lately = x > -options.slow_memory
@@ -276,27 +277,28 @@ def left_by(
         return now
     slow, fast = (Line.through(x, capacity, memory) for memory in (options.slow_memory, options.fast_memory))
     limit, width = min(slow.value, most), min(std, options.widest * most)
-    works = works and demand.line.value > options.least_share * limit
+    works = works and compares and demand.line.value > options.least_share * limit
     leads = works and demand.probability_above(limit - width, width, options) > options.outgrows
     left = demand.time_to(limit) if leads else math.inf
-    now = _seen(now, "lasts", leads, before.lasts + step, left, "draft and slope are to outgrow it", options.lasting)
+    outgrown = "draft and slope are to outgrow the ground"
+    now = _seen(now, 1, lasts[1] if leads else 0.0, left, outgrown, options.lasting)
     peak = float(rows[:, 3].max())
-    left, falls = min(
+    weak = [
         _time_to_weaken(line, memory, x, capacity, reserve, peak, (most, std / most), options)
         for line, memory in ((slow, options.slow_memory), (fast, options.fast_memory))
-    )
-    now = _seen(now, "falls", falls, before.falls + step, left, "the ground is to give less than is asked", options.lasting_fall)
+    ]
+    falls, left = any(warns for _, warns in weak), min(left for left, _ in weak)
+    cause = "the ground is to give less than is asked"
+    now = _seen(now, 2, lasts[2] if falls else 0.0, left, cause, options.lasting_fall)
     return now._replace(share=demand.line.value / limit if limit > 0.0 else 1.0)
 
 
-def _seen(
-    now: Margin, clock: str, holds: bool, since: float, left: float, cause: str, least: float
-) -> Margin:  # fmt: skip
-    """Return the margin after one more look at a cause: since when it holds [s], and the time [s] that it leaves."""
-    now = now._replace(**{clock: since if holds else 0.0})
+def _seen(now: Margin, place: int, lasts: float, left: float, cause: str, least: float) -> Margin:
+    """Return the margin with a cause that has lasted for some time [s], and the time [s] that it leaves; inf: none."""
+    now = now._replace(lasts=(*now.lasts[:place], lasts, *now.lasts[place + 1 :]))
     if math.isfinite(left):
         now = now._replace(time_left=left if now.time_left is None else min(left, now.time_left))
-    return now._replace(cause=f"{cause} in {left:.0f} s") if holds and since >= least else now
+    return now._replace(cause=f"{cause} in {left:.0f} s") if lasts >= least else now
 
 
 @lru_cache(maxsize=2)

@@ -24,6 +24,7 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.driveline import disengaged, idle, shared_out
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.moments import bins_of_a_moment, moments
+from soilbus.decision.options import WATCH
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
@@ -110,7 +111,7 @@ class WindowEstimator:
         self._held = Held()
         self._valid_at: float | None = None
         self._watch, self._warnings = Watch(), Warnings()
-        self._curve: OverSlip | None = None
+        self._curve: tuple[OverSlip | None, float] = None, -np.inf
         self._idle = np.zeros(len(self.rig.wheels), bool)
         self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
@@ -224,7 +225,8 @@ class WindowEstimator:
         """The result with traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
         self._update_watch(window)
-        self._curve = result.curve or self._curve
+        if result.curve is not None:
+            self._curve = result.curve, result.t
         now = as_of(result, self._watch, result.t, self.config)
         if now.traversability.state is State.GO and self._watch.warning is Alert.IMMOBILISATION:
             self._watch, self._warnings = ended(self._watch, self.config), self._warnings._replace(since=None)
@@ -284,14 +286,16 @@ class WindowEstimator:
     def _update_watch(self, window: Undecided) -> None:
         """Update the watch by the last hop, with the curve of the window before."""
         if window.fresh:
-            self._watch, self._curve, self._warnings = Watch(), None, Warnings()
+            self._watch, self._curve, self._warnings = Watch(), (None, -np.inf), Warnings()
         self._warnings = self._warnings._replace(begun=())
         since = -math.inf if window.fresh else window.result.t - self._settings.hop
         driven = window.driven
         settings, chosen = self._settings, np.flatnonzero(driven.t > since)
         bins = bins_of_a_moment(settings.bin)
         for moment in moments(driven, self.rig, window.torque_limit, self.config, chosen, bins):
-            self._watch = watched(self._watch, moment, self._curve, self.config)
+            curve, t = self._curve
+            known = curve if moment.t - t < WATCH.curve_age else None
+            self._watch = watched(self._watch, moment, known, self.config)
             self._warnings = self._warnings.after(moment.t, self._watch.warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
