@@ -78,12 +78,12 @@ MUTATIONS = (
     ),
     Mutation(
         "wheels that spin leave go as it was", "decision/judgement.py",
-        "if loss.spinning and decision.state is not State.NO_GO:", "if False:",
+        "if watch.spinning and decision.state is not State.NO_GO:", "if False:",
         (f"{DECISION}::test_a_wheel_that_spins_is_caution_at_best_and_at_least",),
     ),
     Mutation(
         "a vehicle that is stuck may go", "decision/judgement.py",
-        "    if loss.stuck:\n        return Traversability(", "    if False:\n        return Traversability(",
+        "    if watch.stuck:\n        return Traversability(", "    if False:\n        return Traversability(",
         ("tests/daemon/test_facts.py::test_a_start_in_vain_ends_go_on_the_bus",),
     ),
     Mutation(
