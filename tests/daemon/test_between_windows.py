@@ -108,7 +108,7 @@ def test_pitch_in_gaps_is_no_level_ground_between_windows():
     known, gone = (intake.latest(last) for intake, last in (heard, silent))
     assert known.pitch == pytest.approx(0.1, abs=0.01)
     assert gone.pitch is None
-    assert gone.pull == pytest.approx(known.pull, abs=300.0)  # the whole slope is 2200 N
+    assert gone.moment.given == pytest.approx(known.moment.given, abs=300.0)  # the whole slope is 2200 N
 
 
 def test_frames_and_lines_judge_a_corrected_draft_alike(tmp_path):
