@@ -72,7 +72,7 @@ class WatchOptions:
     """Share of `traversability.max_slip` above which wheels slip much.  The simulator's sweeps reach a slip of 0.40 on
     loam; at 0.67 one of 24 drives had a false warning."""
     near: float = 0.2
-    """What the demand then leaves, as a share.  At 0.15 growing drafts that swing were seen too late in 3 of 10 drives
+    """What the demand then leaves, as a share.  At 0.15 growing drafts that swing were seen too late in 4 of 10 drives
     of `decisions --boggings` in place of 2."""
     kept_share: float = 0.85
     """Share that a demand must fall below for a warning to end."""
