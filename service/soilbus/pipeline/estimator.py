@@ -3,8 +3,8 @@
     WindowTask -> Tracker (posterior of the soil) -> status -> judge (capability, probability) -> hysteresis -> watch
 
 `estimate` needs the estimation only and may run in another process; it returns an `Undecided`: the window's result so
-far and what the decision needs.  `decide` takes these in order and holds the state from window to window: hysteresis,
-loss of traction, immobilisation watch.
+far and what the decision needs.  `decide` takes these in order and holds the state from window to window: hysteresis
+and watch.
 """
 
 from __future__ import annotations
@@ -21,30 +21,14 @@ from soilbus.allocator import keep_freed_memory
 from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
-from soilbus.decision.immobilisation import (
-    Alert,
-    Warnings,
-    Watch,
-    ended,
-    has_cause,
-    moments,
-    watched,
-    with_loss,
-)
+from soilbus.decision.driveline import disengaged, idle, shared_out
 from soilbus.decision.judgement import Basis, judge
+from soilbus.decision.moments import bins_of_a_moment, moments
+from soilbus.decision.options import WATCH
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import (
-    NO_LOSS,
-    bins_of_a_moment,
-    disengaged,
-    idle,
-    motions,
-    observed,
-    shared_out,
-    slope_felt,
-)
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
+from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
 from soilbus.estimation.instrumentation import recompleted
@@ -128,8 +112,7 @@ class WindowEstimator:
         self._held = Held()
         self._valid_at: float | None = None
         self._watch, self._warnings = Watch(), Warnings()
-        self._curve: OverSlip | None = None
-        self._loss = NO_LOSS
+        self._curve: tuple[OverSlip | None, float] = None, -np.inf
         self._idle = np.zeros(len(self.rig.wheels), bool)
         self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
@@ -243,14 +226,12 @@ class WindowEstimator:
         """The result with traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
         self._update_watch(window)
-        self._curve = result.curve or self._curve
-        watch = with_loss(self._watch, self._loss)
-        warned = has_cause(watch, self._loss, self.config.warning.hold)
-        now = as_of(result, self._loss, result.t, self.config, warned)
-        if now.traversability.state is State.GO and watch.warning is Alert.IMMOBILISATION:
-            self._watch, self._warnings = ended(self._watch), self._warnings._replace(since=None)
-            watch = with_loss(self._watch, self._loss)
-        return replace(now, watch=watch, warnings=self._warnings)
+        if result.curve is not None:
+            self._curve = result.curve, result.t
+        now = as_of(result, self._watch, result.t, self.config)
+        if now.traversability.state is State.GO and self._watch.warning is Alert.IMMOBILISATION:
+            self._watch, self._warnings = ended(self._watch, self.config), self._warnings._replace(since=None)
+        return replace(now, watch=self._watch, warnings=self._warnings)
 
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
@@ -304,21 +285,19 @@ class WindowEstimator:
             self._predictions.take(task.end, tracked.prediction)
 
     def _update_watch(self, window: Undecided) -> None:
-        """Update loss of traction and watch by the last hop, with the curve of the window before."""
+        """Update the watch by the last hop, with the curve of the window before."""
         if window.fresh:
-            self._watch, self._curve, self._loss, self._warnings = Watch(), None, NO_LOSS, Warnings()
+            self._watch, self._curve, self._warnings = Watch(), (None, -np.inf), Warnings()
         self._warnings = self._warnings._replace(begun=())
         since = -math.inf if window.fresh else window.result.t - self._settings.hop
         driven = window.driven
         settings, chosen = self._settings, np.flatnonzero(driven.t > since)
         bins = bins_of_a_moment(settings.bin)
-        looks = moments(driven, self.rig, chosen, bins, settings.min_speed)
-        lately = motions(driven, self.rig, window.torque_limit, self.config.traversability, chosen, bins)
-        for moment, motion in zip(looks, lately, strict=True):
-            self._loss = observed(self._loss, motion, self.config)
-            inertia = moment.inertia - slope_felt(self._loss, self.rig)
-            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, inertia)
-            self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)
+        for moment in moments(driven, self.rig, window.torque_limit, self.config, chosen, bins):
+            curve, t = self._curve
+            known = curve if moment.t - t < WATCH.curve_age else None
+            self._watch = watched(self._watch, moment, known, self.config)
+            self._warnings = self._warnings.after(moment.t, self._watch.warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their fitted parameters, or without a fit as configured."""

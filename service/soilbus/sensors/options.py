@@ -1,7 +1,7 @@
 """Options of what becomes of samples, and of the sensors' consistency: each value once, with its unit and evidence.
 
     ReceptionOptions   -> Intake, Bins, outliers, rates
-    ConsistencyOptions -> consistency.implausible, decision.traction_loss
+    ConsistencyOptions -> consistency.implausible, decision.driveline
 
 What a change of 30 % does to each is in service/docs/sensitivity.md.
 """
