@@ -109,9 +109,7 @@ def test_a_hard_draft_that_swings_is_no_cause_however_new_its_peaks(seed):
     assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
 
 
-@pytest.mark.parametrize(
-    "rate", [60.0, known_gap(120.0, why="a draft that grows by a tenth from swing to swing is seen at the last one")]
-)
+@pytest.mark.parametrize("rate", [60.0, 120.0])
 def test_a_swinging_draft_that_outgrows_the_ground_is_foreseen(rate):
     for phase in (0.0, 1.5, 3.0, 4.5):
         out = drive(lambda t: 2400.0 + rate * t + 700.0 * math.sin(1.5 * t + phase))  # noqa: B023

@@ -69,11 +69,11 @@ class WatchOptions:
     """Relative std of the largest pull from which no demand is compared with it: `a-bog2` has 0.27 to 0.36 before it
     bogs, `b-clutch-easy-0` 0.43 and more where nothing happens."""
     slips: float = 0.7
-    """Share of `traversability.max_slip` above which wheels slip much.  The simulator's sweeps reach a slip of 0.40 on
+    """Share of `traversability.max_slip` from which slip alone warns.  The simulator's sweeps reach a slip of 0.40 on
     loam; at 0.67 one of 24 drives had a false warning."""
-    near: float = 0.2
-    """What the demand then leaves, as a share.  At 0.15 growing drafts that swing were seen too late in 4 of 10 drives
-    of `decisions --boggings` in place of 2."""
+    near: float = 0.9
+    """Share from which a demand warns whatever its trend: in 24 drives on loam where nobody gets stuck it reaches 0.89.
+    """
     kept_share: float = 0.85
     """Share that a demand must fall below for a warning to end."""
     lasting: float = 0.4

@@ -7,7 +7,8 @@
     weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q: the ground gives less than its curve
     outgrows       P(Q + h dQ/dt > C) > p, by the errors of earlier such extrapolations and the curve's width
     creeps         P(s + h ds/dt > s_max) > p, by the same errors of slip
-    slips          slip beyond 0.7 s_max while the demand takes all but the curve's width
+    takes all      Q > 0.9 max P_hat
+    slips          s > 0.7 s_max
 
 P: pull given, P_hat: pull over slip of the last window (Kalman filter and regressions with exponential forgetting).
 The first three need no soil: a local linear trend follows q, V and sinkage, and how much slip shakes widens it.  Nor
@@ -267,9 +268,11 @@ def left_by(
         return now
     compares = std < options.unknown * most
     within = rows[:, 1]
-    shortly, near = x > -options.lasting - 0.5 * step, (1.0 - max(options.near, std / most)) * most
-    if compares and float(within[shortly].min()) > options.slips * max_slip and float(rows[shortly, 3].min()) > near:
-        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} % under this draft", time_left=0.0)
+    lately = x > -options.lasting - 0.5 * step
+    if compares and float(rows[lately, 3].min()) > options.near * most:
+        return now._replace(share=1.0, cause="draft and slope take nearly all that the ground gives", time_left=0.0)
+    if compares and float(within[lately].min()) > options.slips * max_slip:
+        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
     reserve = ahead[np.searchsorted(slips, within, "right")] - np.interp(within, slips, pulls)
     capacity = np.where(within >= slips[0], rows[:, 2] + reserve, np.nan)
     lately = x > -options.slow_memory
