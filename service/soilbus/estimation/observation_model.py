@@ -156,6 +156,7 @@ class Linearisation:
     weighed: Array
     normal: Array
     by_latents: Array  # (N, m, 2 W + 1) by the observations of the latents
+    inverse: Array  # (N, m, m) inverse covariance of the rows of each instant
     corrected: Array  # (N, 2 W + 1) observations of the latents over 1 + gain
     variance: Array  # (N, 2 W + 1) variance of `corrected`
     by_gain: Array  # (N, 2 W + 1) minus the derivative of `corrected` by its own gain
@@ -366,6 +367,7 @@ class ObservationModel(Measurements):
             weighed=weighed,
             normal=flat.T @ weighed,
             by_latents=A,
+            inverse=inverse,
             corrected=corrected,
             variance=variance,
             by_gain=latent_by_gain,
@@ -713,8 +715,7 @@ class ObservationModel(Measurements):
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
         self._without_sides(rows, at.by_sides)
         rows[~self._known] = 0.0
-        variance, row_var = self._corrected(gains)[5:]
-        weighed = self.inverse_covariance(at.by_latents, variance, row_var) @ rows
+        weighed = at.inverse @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
     def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:

@@ -93,9 +93,9 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     A, (N, m) = optimum.at.by_latents, optimum.at.by_latents.shape[:2]
     e = optimum.at.weighed[:, RESIDUAL].reshape(N, m)
     variance, row_var = problem.variances(optimum.gains)
-    inverse = problem.inverse_covariance(A, variance, row_var)
-    by_latents = np.einsum("nml,nm->nl", A, e)
-    shares = variance * np.einsum("nml,nmk,nkl->nl", A, inverse, A, optimize=True)
+    inverse = optimum.at.inverse
+    by_latents = (e[:, None] @ A)[:, 0]
+    shares = variance * (A * (inverse @ A)).sum(axis=1)
     of_rows = row_var * np.einsum("nmm->nm", inverse)
     layout, known = problem.layout, problem.known
     known = known & problem.measured_rows
