@@ -167,7 +167,9 @@ class WindowEstimator:
             self._gain_names, self._gain_std = gains_of(self._driven_rig)
             self._tracker.start_from(before, since)
             self._predictions = PredictionWatch(self._settings.window)
-        window = task.window.rows(np.flatnonzero(task.window.t > self._engaged_at))
+        window = task.window
+        if len(window.t) and window.t[0] <= self._engaged_at:
+            window = window.rows(np.flatnonzero(window.t > self._engaged_at))
         return recompleted(window, self.rig, self._driven_rig)
 
     def solve(self, task: WindowTask) -> WindowResult:
