@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -110,7 +111,7 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     squares = np.stack([(v**2).sum(axis=0) for v in (values, block_sums(values, problem.t, options.block))])
     shown = expected.sum(axis=0)
     latents, computed = np.arange(m, m + layout.n_latents), slice(m + layout.n_latents, None)
-    of_kind = {
+    of_kind: dict[str, Any] = {
         "torque": layout.torques, "draft": [layout.balance], "sinkage": slice(layout.sinkages.start, m),
         "load": latents[loads], "computed_load": computed, "speed": latents[layout.speeds],
         "ground_speed": latents[[layout.ground_speed]],
