@@ -28,14 +28,11 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.instants import averaged
 from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import (
-    TIME_TOLERANCE,
-    ObservationModel,
-    ObservationModelWithEffects,
-)
+from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -44,7 +41,7 @@ from soilbus.estimation.search_budget import SearchBudget
 from soilbus.estimation.soil_state import ChangePoint, Reason, Shown, SoilState, TrackerState, next_state
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.variance_components import VarianceComponents, correction_ratios
-from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window, window_of_samples
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
@@ -82,17 +79,20 @@ class Settings:
         Evaluations of the model that searches may take, see `SearchBudget`.
     hop : float
         Time [s] from one window to the next.
+    instant : float
+        Length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins.
     """
 
     window: float
     min_speed: float
     max_turn: float
     drift: float
-    min_rows: int = 60
+    min_rows: int = 15
     form: tuple[float, ...] = ()
     search_rate: float = 4.0
     search_burst: float = 100.0
     hop: float = 1.0
+    instant: float = ESTIMATOR.tracker.instant
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,6 +252,7 @@ class Tracker:
         -------
         TrackerOutput
         """
+        window = averaged(window, end, self.settings.instant)
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
         if not recent:  # what windows before left is no measure of ground that none of them was on

@@ -124,7 +124,8 @@ class WindowEstimator:
             hop=settings.hop,
         )  # fmt: skip
         if config.table is not None:
-            of_tracker = replace(of_tracker, min_rows=1)  # a table's rows are chosen with care, and few
+            of_tracker = replace(of_tracker, min_rows=1, instant=0.0)  # a table's rows are chosen with care, and few
+        self._instant = of_tracker.instant or settings.bin
         self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
         self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
         self._driven_rig = self.rig
@@ -150,7 +151,9 @@ class WindowEstimator:
             self._gain_names, self._gain_std = gains_of(self._driven_rig)
             self._tracker.start_from(before, since)
             self._predictions = PredictionWatch(self._settings.window)
-        window = task.window.rows(np.flatnonzero(task.window.t > self._engaged_at))
+        window = task.window
+        if len(window.t) and window.t[0] <= self._engaged_at:
+            window = window.rows(np.flatnonzero(window.t > self._engaged_at))
         return recompleted(window, self.rig, self._driven_rig)
 
     def solve(self, task: WindowTask) -> WindowResult:
@@ -375,12 +378,12 @@ class WindowEstimator:
 
     def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
         """The instants of a fit, and the distance driven since the last of them."""
-        instants = np.empty(0) if fit is None else fit.optimum.t
-        end = instants[-1] + self._settings.bin / 2.0 if len(instants) else -math.inf
+        instants, each = np.empty(0) if fit is None else fit.optimum.t, self._instant
+        end = min(instants[-1] + each / 2.0, task.end) if len(instants) else -math.inf
         since = task.window.ground_speed[task.window.t > end]
         known = since[np.isfinite(since)]
         unseen = float(known.mean()) * len(since) * self._settings.bin if len(known) else 0.0
-        return Basis(instants, self._settings.bin, unseen, task.late)
+        return Basis(instants, each, unseen, task.late)
 
     def _status(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         """Status and reason; a second sender or an implausible sensor replaces the reasons that it may have caused."""
