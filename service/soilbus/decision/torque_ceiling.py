@@ -4,7 +4,7 @@ Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked
 not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
 
     follows      T - b (Q - Q') - T' (N / N' - 1) has no trend     b = T' / sum(T' / r): its share of the thrust
-    saturated    T has no trend, and it does not follow            a trend: a slope beyond what its residuals explain
+    saturated    T - T' is noise, and T does not follow            a trend: a slope beyond what its residuals explain
 
 What shakes the vehicle has no trend, however little its sensors say of their noise.
 A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
@@ -114,27 +114,29 @@ class TorqueCeiling:
 
 
 def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
-    """Which wheels' torques (W,) have no trend while the pull asked of the vehicle has one that they would follow."""
+    """Which wheels' torques (W,) stand within noise and do not follow the trend of the pull asked of the vehicle."""
     assert rig.chassis is not None
     pull = pull_asked(window, rig.chassis) + np.maximum(inertia_of(window, rig.chassis), 0.0)
-    mean = window.torque.mean(axis=0)
+    mean, n = window.torque.mean(axis=0), len(window.t)
     since = (window.t - window.t.mean())[:, None]
     with np.errstate(all="ignore"):  # nan and inf where a sensor sends what no motor gives
         share = mean / np.nansum(mean / rig.radius)
         by_pull = (pull - pull.mean())[:, None] * share
         by_load = np.nan_to_num(mean * (window.load / window.load.mean(axis=0) - 1.0))
-        stands = np.abs(_trend(since, window.torque)) <= deviations
-        follows = [np.abs(_trend(since, window.torque - by_pull - part)) <= deviations for part in (0.0, by_load)]
+        spread = ((window.torque - mean) ** 2 / window.variance["torque"]).sum(axis=0)
+        stands = spread <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
+        follows = [_trend(since, window.torque - by_pull - part) <= deviations for part in (0.0, by_load)]
     return np.asarray((share > 0.0) & stands & ~follows[0] & ~follows[1])
 
 
 def _trend(since: Array, values: Array) -> Array:
-    """Slope of each column (N, W) over time (N, 1) in its standard deviations, which the residuals say; nan if flat."""
-    values = values - values.mean(axis=0)
+    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959)."""
+    values, free = values - values.mean(axis=0), len(values) - 2
     spread = float((since**2).sum())
     slope = (since * values).sum(axis=0) / spread
-    rest = ((values - slope * since) ** 2).sum(axis=0) / (len(values) - 2)
-    return np.asarray(slope / np.sqrt(rest / spread))
+    rest = ((values - slope * since) ** 2).sum(axis=0) / free
+    share = (8.0 * free + 1.0) / (8.0 * free + 3.0)
+    return np.asarray(share * np.sqrt(free * np.log1p(slope**2 * spread / rest / free)))
 
 
 def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
