@@ -49,8 +49,8 @@ MASS_GAIN = "load.weight"
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
-    "inertia", "inertia_var", "draft_beside", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
-    "acceleration_var",
+    "inertia", "inertia_var", "draft_beside", "has_balance", "pitch", "since", "distance", "wheel_angle",
+    "acceleration", "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
     "_side_known", "standing_rows", "standing_latents",
 )  # fmt: skip
