@@ -198,6 +198,12 @@ class Tracker:
         return self.prior if self._state.transition is None else self._new_soil_prior
 
     @property
+    def instant(self) -> float:
+        """Length [s] of an instant; 0, bins as they are, on tracks alone: no tyre relaxes or bounces."""
+        lengths = self.rig.lengths
+        return 0.0 if lengths is not None and (lengths > 0.0).all() else self.settings.instant
+
+    @property
     def state(self) -> SoilState:
         """Which soil the last window was of."""
         return self._state
@@ -252,7 +258,7 @@ class Tracker:
         -------
         TrackerOutput
         """
-        window = averaged(window, end, self.settings.instant)
+        window = averaged(window, end, self.instant)
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
         return replace(self._estimate(window, end), search_ended=self._budget.ended)
