@@ -482,9 +482,12 @@ def minimise(
                 evaluations += 1
             continue
         last_decrease = here.decrease if fraction == 1.0 else 0.0
-        if there.value > here.value:
+        if there.value > here.value:  # it overshot
             max_rise *= options.shortening
-        here, n_rejected, fraction = there, 0, min(2.0 * fraction, 1.0)
+            fraction *= options.shortening
+        else:
+            fraction = min(2.0 * fraction, 1.0)
+        here, n_rejected = there, 0
         if here.value < lowest.value:
             lowest = here
     if ended is not Termination.STEP:

@@ -125,7 +125,6 @@ class WindowEstimator:
         )  # fmt: skip
         if config.table is not None:
             of_tracker = replace(of_tracker, min_rows=1, instant=0.0)  # a table's rows are chosen with care, and few
-        self._instant = of_tracker.instant or settings.bin
         self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
         self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
         self._driven_rig = self.rig
@@ -378,7 +377,7 @@ class WindowEstimator:
 
     def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
         """The instants of a fit, and the distance driven since the last of them."""
-        instants, each = np.empty(0) if fit is None else fit.optimum.t, self._instant
+        instants, each = np.empty(0) if fit is None else fit.optimum.t, self._tracker.instant or self._settings.bin
         end = min(instants[-1] + each / 2.0, task.end) if len(instants) else -math.inf
         since = task.window.ground_speed[task.window.t > end]
         known = since[np.isfinite(since)]
