@@ -551,12 +551,12 @@ def with_changed(
 HILLS = tuple((4.0 * i, 0.08 * (-1.0) ** i) for i in range(30))
 
 
-def of_wheels(recording: Recording) -> dict[str, Any]:
-    """The ground speed that a controller computes from the wheels."""
+def of_wheels(recording: Recording, wheels: Sequence[str] = WHEELS) -> dict[str, Any]:
+    """The ground speed that a controller computes from these wheels."""
     ground = recording.channels["ground_speed"]
     rims = [
         np.interp(ground.t, own.t, own.value) * radius
-        for own, radius in ((recording.channels[f"speed.{w}"], 0.5 if w[0] == "F" else 0.62) for w in WHEELS)
+        for own, radius in ((recording.channels[f"speed.{w}"], 0.5 if w[0] == "F" else 0.62) for w in wheels)
     ]
     return {"ground_speed": np.mean(rims, axis=0)}
 
@@ -568,7 +568,8 @@ def scaled(name: str, factor: float) -> Callable[[Recording], dict[str, Any]]:
 @pytest.mark.parametrize(
     ("change", "slope", "says"),
     [
-        (of_wheels, (), "signals.ground_speed: goes with the driven wheels"),
+        (of_wheels, (), "signals.ground_speed: goes with the "),
+        (lambda r: of_wheels(r, ("RL", "RR")), (), "signals.ground_speed: goes with the rear wheels"),
         (scaled("draft", 0.1), (), "scale of the draft"),
         (scaled("draft", 1.0 / 9.80665), (), "kgf or daN where the DBC says N"),
         (scaled("acceleration", 10.0), (), "signals.acceleration: changes"),

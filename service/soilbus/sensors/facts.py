@@ -73,10 +73,10 @@ class Limits:
     """Least thrust over pull: the thrust includes rolling resistance, at least a hundredth of the weight."""
     most_thrust: float = 0.9
     """Largest median thrust over weight that soil can bear for long."""
-    least_slip: float = 0.02
-    """Slip [1] that comes with a thrust of the weight, at least: cars on dry asphalt have about 0.03 (Gustafsson 1997,
-    Automatica 33:1087), the field vehicle 1.1 to 3.1, a rear-driven tractor 0.48, a speed computed from its motor's
-    0.00."""
+    least_slip: float = 0.03
+    """Slip [1] that comes with a thrust of the load, at least; twice as much is a warning. Cars on dry asphalt have as
+    much (Gustafsson 1997, Automatica 33:1087), multibody tractors 0.6 on a road and 0.8 on loam, the field vehicle 1 to
+    3, a speed computed from an axle's wheels 0.000 to 0.027 +- 0.007."""
     tilted: float = 0.004
     """Sd of the slope [rad] from which it shows whether an accelerometer feels gravity: four times the sensor's own
     noise (`noise.pitch`)."""

@@ -1,6 +1,6 @@
 """Check of a configuration against a recording: ground speed, slope, acceleration, yaw rate.
 
-    wheel speed     changes of slip = a * changes of thrust over weight, a > 0: on no ground is it nothing
+    wheel speed     changes of slip = a * changes of thrust over load, a > 0: on no ground is it nothing
     accelerometer   changes of its readings = a * changes of ground speed + b * those of g sin(pitch), a = 1, and b = 1
                     where it feels gravity, else 0
     slope           changes of thrust rise with those of m g sin(pitch)
@@ -19,6 +19,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.window import forward, pairs, pull_given
+from soilbus.grouping import grouped
 from soilbus.sensors.consistency import change, median, moving_sum
 from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, block_means, regression, steps
 from soilbus.terra.vehicle import GRAVITY
@@ -27,27 +28,38 @@ __all__ = ["MOTION_CHECKS"]
 
 
 def _wheel_based(facts: Facts) -> Iterator[Finding]:
-    """A ground speed in which there is no slip while the thrust changes."""
-    driven = [next(w for w in facts.config.wheel if w.name == wheel).driven for wheel in facts.rig.wheels]
-    chassis = facts.rig.chassis
-    if chassis is None or not any(driven):
-        return
+    """A ground speed against which an axle does not slip while its thrust changes."""
     lag, block = steps(facts)
-    thrust = facts.thrust.sum(axis=1) / (chassis.mass * GRAVITY)
-    rows = np.stack([change(a, lag) for a in (facts.slip[:, driven].mean(axis=1), thrust)], axis=1)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 40 * block:
-        return
-    slip, moved = block_means(rows, block).T
-    (per_thrust,), (sd,) = regression(slip, moved[:, None])
-    if moved.std() > LIMITS.excited and per_thrust + LIMITS.side_sd * sd < LIMITS.least_slip:
-        yield Finding(
-            f"signals.ground_speed: goes with the driven wheels: no slip comes with thrust, which moves by"
-            f" {moved.std() * chassis.mass * GRAVITY / 1e3:.1f} kN within 1 s: is it computed from wheels or motor?"
-            " map a radar's or a receiver's speed",
-            True,
-            ("ground_speed",),
-        )
+    for axle, own in _driven_axles(facts).items():
+        carried = median(facts.window.load[:, own].sum(axis=1))
+        rows = [facts.slip[:, own].mean(axis=1), facts.thrust[:, own].sum(axis=1) / carried]
+        changes = np.stack([change(a, lag) for a in rows], axis=1)
+        changes = changes[np.isfinite(changes).all(axis=1)]
+        if len(changes) < 40 * block:
+            continue
+        slip, moved = block_means(changes, block).T
+        (per_thrust,), (sd,) = regression(slip, moved[:, None])
+        most = (per_thrust + LIMITS.side_sd * sd) / LIMITS.least_slip
+        if moved.std() > LIMITS.excited and most < 2.0:
+            yield Finding(
+                f"signals.ground_speed: goes with the {axle} wheels: hardly any slip comes with their thrust, which"
+                f" moves by {moved.std() * carried / 1e3:.1f} kN within 1 s: is it computed from wheels or motor? map a"
+                " radar's or a receiver's speed",
+                most < 1.0,
+                ("ground_speed",) if most < 1.0 else (),
+            )
+            return
+
+
+def _driven_axles(facts: Facts) -> dict[str, list[int]]:
+    """Wheels of each axle whose own torque is measured; where there is none, all driven wheels."""
+    driven = [w for w in facts.config.wheel if w.driven and w.name in facts.rig.wheels]
+    axles = {
+        axle: [w.name for w in wheels]
+        for axle, wheels in grouped(driven, lambda w: str(w.axle)).items()
+        if f"torque.{axle}" in facts.mapped or {f"torque.{w.name}" for w in wheels} <= facts.mapped
+    } or {"driven": [w.name for w in driven]}
+    return {axle: [facts.rig.wheels.index(name) for name in names] for axle, names in axles.items() if names}
 
 
 class Felt(NamedTuple):
