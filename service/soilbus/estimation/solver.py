@@ -363,15 +363,6 @@ class Objective:
         of_base, prior = Gaussian(base, gains, logs), self.coordinates.prior
         return of_base.relinearised(soil, gains, prior, self.coordinates.width)
 
-    def shifted(self, gaussian: Gaussian, step: Array, covariance: Array) -> Gaussian:
-        """A Gaussian shifted by a step (F + A,), with this covariance (F + A, F + A) of the step added."""
-        free, gains = len(self.free), gaussian.gains.copy()
-        gains[self.active] += step[free:]
-        soil = self.coordinates.stepped(gaussian.soil, step[:free])
-        added = self.gaussian(gaussian.soil, gains, covariance).covariance
-        wider = replace(gaussian, covariance=gaussian.covariance + added)
-        return wider.relinearised(soil, gains, self.coordinates.prior, self.coordinates.width)
-
 
 class Termination(StrEnum):
     """Why a descent ended."""

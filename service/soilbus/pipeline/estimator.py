@@ -174,7 +174,7 @@ class WindowEstimator:
         status, reason = self._status(task, tracked)
         own = posterior = None
         if fit is not None and status is not Status.INVALID:
-            own = posterior = fit.mode.posterior.widened(_widening(fit), self.prior)
+            own = posterior = fit.mode.posterior
             if fit.form is not None:
                 posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
         basis = self._basis(task, fit)
@@ -312,9 +312,8 @@ class WindowEstimator:
         speed, fit = self._usual_speed(window), tracked.fit
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
-        widening = _widening(fit)
         return UncertainModel.of(
-            self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, fit.form
         )
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
@@ -453,8 +452,3 @@ def _soil_change(tracked: TrackerOutput) -> SoilChange:
 def _gated(tracked: TrackerOutput) -> str:
     """Reason for which most instants were left out: standstill or turning."""
     return "standstill" if tracked.standstill >= tracked.turning else "turning"
-
-
-def _widening(fit: Fit) -> float:
-    """Return the factor of a fit's covariance: its chi-square per residual where that is more than earlier ones."""
-    return max(fit.chi2, 1.0)
