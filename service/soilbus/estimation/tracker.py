@@ -259,12 +259,11 @@ class Tracker:
         -------
         TrackerOutput
         """
-        window = averaged(window, end, self.instant)
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
         if not recent:  # what windows before left is no measure of ground that none of them was on
             self._components = VarianceComponents(self.rig.options.variance)
-        return replace(self._estimate(window, end), search_ended=self._budget.ended)
+        return replace(self._estimate(averaged(window, end, self.instant), end), search_ended=self._budget.ended)
 
     def _estimate(self, window: Window, end: float) -> TrackerOutput:
         """One step of the recursion: data of the present soil, explanation, next state, report."""
