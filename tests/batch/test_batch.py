@@ -304,7 +304,7 @@ def test_a_parameter_at_the_edge_of_its_range_has_no_deviation_of_zero():
     sizes = {"softening": {"value": 0.4, "std": 0.03}, "dug": {"value": 0.0, "std": 0.0}}
     effect = {"name": "slip_sinkage", "parameters": sizes, "named": True, "onset": None}
     vehicle = {"vehicle": "T1", "effects": [effect], "logs": ["a.log"], "fault": None}
-    text = fleet_text({"vehicles_diagnosed": 1, "vehicles": [vehicle], "false_discovery_rate": 0.1, "types": []})
+    text = fleet_text({"vehicles_diagnosed": 1, "vehicles": [vehicle], "false_discovery_rate": 0.1})
     assert "T1: slip_sinkage (softening 0.4 ± 0.03, dug 0 (at the edge of its range))" in text
 
 

@@ -89,7 +89,6 @@ def test_logs_that_contradict_each_other_are_diagnosed_apart_where_that_explains
         "diagnose": found,
         "fit_model": lambda records, *_: SimpleNamespace(neg2_log_evidence=1000.0 if len(records) == 2 else 100.0),
         "onsets_of": lambda *_: {},
-        "factors_of": lambda *_: {},
     }
     for function, fake in fakes.items():
         monkeypatch.setattr(f"soilbus.diagnosis.fleet.{function}", fake)
@@ -111,7 +110,7 @@ def test_logs_that_contradict_the_later_ones_stay_out_whatever_explains_these(mo
         name = of.additions[0].effect.name
         return {name: Onset(1, (0.0, 1.0), 0.0, ()) if name == "bulldozing" else Onset(0, (0.6, 0.4), 0.0, ())}
 
-    fakes = {"diagnose": found, "onsets_of": onsets, "factors_of": lambda *_: {}, "fit_model": lambda *_: None}
+    fakes = {"diagnose": found, "onsets_of": onsets, "fit_model": lambda *_: None}
     for name, fake in fakes.items():
         monkeypatch.setattr(f"soilbus.diagnosis.fleet.{name}", fake)
     logs = [SimpleNamespace(training=SimpleNamespace(effects=())) for _ in range(2)]
@@ -123,15 +122,13 @@ def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():
         effects = [{"name": effect, "probability": p, "parameters": {}, "onset": None} for effect, p in chances.items()]
         return {"vehicle": name, "verdict": "named" if chances else None, "effects": effects}
 
-    of_type = {"effects": [{"name": "tyre_deflection", "probability": 0.96}]}
-    fleet = judged([of_type], [
+    fleet = judged([
         vehicle("a", draft_offset=0.99, slip_sinkage=0.98), vehicle("b", slip_sinkage=0.97),
         vehicle("c", slip_sinkage=0.5), vehicle("d"),
     ])  # fmt: skip
     assert [[e["name"] for e in v["effects"] if e["named"]] for v in fleet["vehicles"]] == [
         ["draft_offset", "slip_sinkage"], ["slip_sinkage"], [], [],
     ]  # fmt: skip
-    assert fleet["types"][0]["effects"][0]["named"]
     shares = {effect["name"]: (effect["vehicles_named"], effect["expected_share"]) for effect in fleet["effects"]}
     assert shares["slip_sinkage"] == (2, pytest.approx(2.45 / 3))
     assert fleet["vehicles_diagnosed"] == 3

@@ -23,7 +23,6 @@ from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.vehicle_type import Factor, SharedEffect, factors_of, records_with, shared_effects
 from soilbus.diagnosis.verdict import Verdict, temperature
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -32,7 +31,6 @@ __all__ = [
     "FALSE_DISCOVERY_RATE",
     "Onset",
     "VehicleDiagnosis",
-    "diagnose_type",
     "diagnose_vehicle",
     "named",
     "onset_of",
@@ -79,13 +77,10 @@ class VehicleDiagnosis:
         Joint diagnosis of the logs that have the effects: all, or those from the onset of the first effect on.
     onsets
         Of each effect found, by name; none where there is one log only.
-    factors
-        What the logs say of the size of each effect that other vehicles may share, by name.
     """
 
     diagnosis: Diagnosis
     onsets: Mapping[str, Onset]
-    factors: Mapping[str, Factor]
 
     @property
     def places(self) -> list[dict[str, float]]:
@@ -103,16 +98,11 @@ class VehicleDiagnosis:
     @property
     def probabilities(self) -> dict[str, float]:
         """Probability of each effect that may be in the model."""
-        return by_name(self.places)
-
-
-def by_name(places: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The greatest probability of each name."""
-    found: dict[str, float] = {}
-    for place in places:
-        for name, p in place.items():
-            found[name] = max(p, found.get(name, 0.0))
-    return found
+        found: dict[str, float] = {}
+        for place in self.places:
+            for name, p in place.items():
+                found[name] = max(p, found.get(name, 0.0))
+        return found
 
 
 def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Sequence[Effect]) -> VehicleDiagnosis:
@@ -142,11 +132,7 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
         # one value of the effect for all logs was wrong: it belongs to those from its onset on
         first, found = begin, diagnose(records[begin:], prior, catalogue)
         onsets = onsets_of(records, prior, found)
-    try:
-        factors = factors_of(records[first:], prior, found, catalogue)
-    except np.linalg.LinAlgError:  # the vehicle then says nothing of its type
-        factors = {}
-    return VehicleDiagnosis(found, onsets, factors)
+    return VehicleDiagnosis(found, onsets)
 
 
 def _first_diagnosis(records: Sequence[Record], prior: SoilPrior, catalogue: Sequence[Effect]) -> tuple[int, Diagnosis]:
@@ -178,37 +164,6 @@ def _first_diagnosis(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
 def _explained(found: Diagnosis) -> float:
     """Fall of -2 log evidence by all effects added."""
     return found.base.neg2_log_evidence - found.completed.neg2_log_evidence
-
-
-def diagnose_type(
-    vehicles: Sequence[Sequence[Record]], prior: SoilPrior, catalogue: Sequence[Effect]
-) -> tuple[tuple[SharedEffect, ...], list[VehicleDiagnosis]]:
-    """The effects that vehicles of a type share, and the diagnosis of each vehicle beside them.
-
-    Parameters
-    ----------
-    vehicles
-        The records of each.
-    prior, catalogue
-        As of diagnose_vehicle().
-
-    Raises
-    ------
-    NotFitted
-        Where already the present model cannot be fitted to some vehicle.
-    """
-    found: list[VehicleDiagnosis] = []
-
-    def factors_beside(shared: tuple[SharedEffect, ...]) -> list[Mapping[str, Factor]]:
-        found.clear()
-        for v, records in enumerate(vehicles):
-            for one in shared:
-                records = records_with(records, one.effect, one.given[v])
-            found.append(diagnose_vehicle(records, prior, catalogue))
-        return [each.factors for each in found]
-
-    n_wheels = vehicles[0][0].training.n_wheels
-    return shared_effects({effect.name: effect for effect in catalogue}, n_wheels, factors_beside), found
 
 
 def onsets_of(records: Sequence[Record], prior: SoilPrior, found: Diagnosis) -> dict[str, Onset]:

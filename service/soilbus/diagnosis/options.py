@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from soilbus.estimation.options import SolverOptions
 
-__all__ = ["DEFAULT", "TYPE_DEFAULT", "DiagnosisOptions", "TypeOptions"]
+__all__ = ["DEFAULT", "DiagnosisOptions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,21 +96,5 @@ class DiagnosisOptions:
     pitch of a simulated drive is late that is not."""
 
 
-@dataclass(frozen=True, slots=True)
-class TypeOptions:
-    """Judgement of what the vehicles of a type share."""
-
-    min_vehicles: int = 3
-    """Vehicles from which on a type is judged: of two that differ, nothing says which one is the type's."""
-    shown_log_evidence: float = 1.0
-    """Log evidence [1], tempered, from which on a vehicle shows an effect: where its logs say nothing of it, that
-    scatters about zero, and with 0 the fault of one vehicle among such is taken for the type's."""
-    left_out_share: float = 1.0 / 32.0
-    """Share [1] of the vehicles that are left out at once, one at least.  It bounds the time: of 1000 vehicles, 20 % of
-    them with a fault of their own, the same are left out one at a time, in twelve times the time."""
-
-
 DEFAULT = DiagnosisOptions()
 """What a recording's diagnosis has unless another is given with it."""
-TYPE_DEFAULT = TypeOptions()
-"""What the judgement of a type has unless another is given."""

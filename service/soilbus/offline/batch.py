@@ -36,11 +36,9 @@ from soilbus.files import LIMITS, read_bounded
 from soilbus.grouping import grouped
 from soilbus.offline import dataset
 from soilbus.offline.fleet import (
-    Given,
     chosen,
     effect_rows,
     findings_of,
-    findings_of_type,
     judged,
     no_findings,
 )
@@ -593,20 +591,14 @@ def _diagnose_all(
     progress: Callable[[str], None],
     retry: bool,
 ) -> dict[str, Any]:
-    """Findings of every vehicle, kept one by one, those of each type together, and the fleet's diagnosis of them."""
+    """Findings of every vehicle, kept one by one, and the fleet's diagnosis of them."""
     read = [job for job in jobs if job.digest in summaries]
     read.sort(key=lambda job: (summaries[job.digest].get("begin") or 0, job.log))
     of_vehicles = grouped(read, lambda job: (job.setup.digest, job.vehicle))
-    types = grouped((chosen(group) for _, group in sorted(of_vehicles.items())), lambda group: group[0].setup.digest)
-    found = [
-        findings_of_type(
-            vehicles[0][0].setup,
-            len(vehicles),
-            partial(_diagnosed, client, vehicles, parts=out / "parts", progress=progress, retry=retry),
-        )
-        for vehicles in types.values()
-    ]
-    fleet = judged([of_type for of_type, _ in found], [each for _, findings in found for each in findings])
+    vehicles = [chosen(group) for _, group in sorted(of_vehicles.items())]
+    found = _diagnosed(client, vehicles, out / "parts", progress, retry)
+    named = [group[0].setup.name for group in vehicles]
+    fleet = judged([each | {"configuration": name} for each, name in zip(found, named, strict=True)])
     dataset.put(out / OF_DIAGNOSIS[0], [(json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode()])
     dataset.write_rows(out / OF_DIAGNOSIS[1], effect_rows(fleet), dataset.EFFECT_COLUMNS)
     return fleet
@@ -615,18 +607,15 @@ def _diagnose_all(
 def _diagnosed(
     client: Any,
     vehicles: Sequence[Sequence[Job]],
-    given: Sequence[Given],
     parts: Path,
     progress: Callable[[str], None],
     retry: bool,
 ) -> list[dict[str, Any]]:
-    """Findings of each vehicle beside the effects given for it; those that are kept are not made again."""
-    kept = [parts / f"{_digest_of(jobs, each, parts)}.json" for jobs, each in zip(vehicles, given, strict=True)]
+    """Findings of each vehicle; those that are kept are not made again."""
+    kept = [parts / f"{_digest_of(jobs, parts)}.json" for jobs in vehicles]
     left = {path.stem: v for v, path in enumerate(kept) if not _are_kept(path, retry)}
     unseen = _unseen_folders(client, (job for v in left.values() for job in vehicles[v]))
-    tasks = (
-        (digest, ([_carrying(job, unseen) for job in vehicles[v]], __version__, given[v])) for digest, v in left.items()
-    )
+    tasks = ((digest, ([_carrying(job, unseen) for job in vehicles[v]], __version__)) for digest, v in left.items())
     for n, (digest, findings) in enumerate(done_in_turn(client, findings_of, tasks), 1):
         if isinstance(findings, OtherVersion):
             raise BatchError(str(findings))
@@ -634,8 +623,7 @@ def _diagnosed(
             fault = f"{one_line(Exception(str(findings)), 200)} ({type(findings).__name__})"
             findings = no_findings(vehicles[left[digest]][0].vehicle, fault)
         dataset.put(kept[left[digest]], [json.dumps(known(findings), indent=1, allow_nan=False).encode()])
-        beside = f" beside {', '.join(given[0])}" if given[0] else ""
-        progress(f"{n} of {len(left)} vehicles diagnosed{beside}")
+        progress(f"{n} of {len(left)} vehicles diagnosed")
     return [json.loads(read_bounded(path, LIMITS.whole)) for path in kept]
 
 
@@ -647,9 +635,9 @@ def _are_kept(path: Path, retry: bool) -> bool:
     return not (findings.get("fault") or findings.get("left_out"))
 
 
-def _digest_of(jobs: Sequence[Job], given: Given, parts: Path) -> str:
-    """Names the findings of a vehicle: of its logs as they were read, and the effects given."""
-    of = hashlib.sha256(json.dumps(given, sort_keys=True).encode())
+def _digest_of(jobs: Sequence[Job], parts: Path) -> str:
+    """Names the findings of a vehicle: of its logs as they were read."""
+    of = hashlib.sha256()
     for job in jobs:
         of.update(job.digest.encode() + _kept_path(parts, job.digest).read_bytes())
     return of.hexdigest()[:24]

@@ -48,13 +48,6 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
         f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
         f"at most {fleet['false_discovery_rate']:.0%} are expected to be false"
     ]
-    for of_type in fleet["types"]:
-        for effect in of_type["effects"]:
-            if effect["named"]:
-                lines.append(
-                    f"  all of {of_type['configuration']}: {effect['name']} ({_sizes(effect)}), "
-                    f"as {len(effect['agreeing'])} of {len(of_type['vehicles'])} vehicles show"
-                )
     for vehicle in fleet["vehicles"]:
         for effect in vehicle["effects"]:
             if effect["named"]:
