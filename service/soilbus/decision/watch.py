@@ -221,7 +221,7 @@ class Margin(NamedTuple):
     cause
         What is seen now; empty for nothing.
     time_left
-        [s] until the capacity falls to the demand; None where it is not known.
+        [s] until the capacity falls to the demand, inf where it does not; None where it is not known.
     """
 
     rows: Array = np.empty((0, 4))
@@ -269,10 +269,13 @@ def left_by(
     compares = std < options.unknown * most
     within = rows[:, 1]
     lately = x > -options.lasting - 0.5 * step
+    level = ""
     if compares and float(rows[lately, 3].min()) > options.near * most:
-        return now._replace(share=1.0, cause="draft and slope take nearly all that the ground gives", time_left=0.0)
-    if compares and float(within[lately].min()) > options.slips * max_slip:
-        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
+        level = "draft and slope take nearly all that the ground gives"
+    elif compares and float(within[lately].min()) > options.slips * max_slip:
+        level = f"wheels slip by {100.0 * slip:.0f} %"
+    if level:
+        now = now._replace(share=1.0, cause=level)
     reserve = ahead[np.searchsorted(slips, within, "right")] - np.interp(within, slips, pulls)
     capacity = np.where(within >= slips[0], rows[:, 2] + reserve, np.nan)
     lately = x > -options.slow_memory
@@ -293,7 +296,8 @@ def left_by(
     falls, left = any(warns for _, warns in weak), min(left for left, _ in weak)
     cause = "the ground is to give less than is asked"
     now = _seen(now, 2, lasts[2] if falls else 0.0, left, cause, options.lasting_fall)
-    return now._replace(share=demand.line.value / limit if limit > 0.0 else 1.0)
+    share = max(now.share, demand.line.value / limit) if limit > 0.0 else 1.0
+    return now._replace(share=share, time_left=math.inf if now.time_left is None else now.time_left)
 
 
 def _seen(now: Margin, place: int, lasts: float, left: float, cause: str, least: float) -> Margin:

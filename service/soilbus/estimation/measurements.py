@@ -49,7 +49,7 @@ MASS_GAIN = "load.weight"
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
-    "inertia", "inertia_var", "draft_beside", "has_balance", "pitch", "since", "distance", "wheel_angle",
+    "inertia", "inertia_var", "draft_noise", "has_balance", "pitch", "since", "distance", "wheel_angle",
     "acceleration", "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
     "_side_known", "standing_rows", "standing_latents",
@@ -295,7 +295,8 @@ class Measurements:
         self.inertia, self.demand_var = inertia, draft_var + inertia_var
         self.has_balance = known & usable.all(axis=1)
         self.draft_var, self.inertia_var = np.where(self.has_balance, [draft_var, inertia_var], 0.0)
-        self.draft_beside = _mean_beside(self.draft, self.has_balance)
+        stepped = float((np.diff(self.draft[self.has_balance]) ** 2).sum())  # holds the noise of readings twice
+        self.draft_noise = self.draft_var * min(1.0, stepped / max(2.0 * float(self.draft_var.sum()), 1e-9))
 
     @property
     def demand(self) -> Array:
@@ -482,10 +483,3 @@ def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array
     spread, noise = (np.convolve(a, near, "same") for a in ((speed - curve.value) ** 2, variance))
     count = np.convolve(np.ones(len(t)), near, "same")
     return curve.slope, np.maximum(spread, noise) / count * curve.slope_gain
-
-
-def _mean_beside(value: Array, known: NDArray[np.bool_]) -> Array:
-    """Mean (N,) of the instants just before and after, whose noise is another; 0 where neither is known."""
-    around = np.pad(np.where(known, value, 0.0), 1)
-    count = np.pad(known.astype(float), 1)
-    return np.asarray((around[:-2] + around[2:]) / np.maximum(count[:-2] + count[2:], 1.0))

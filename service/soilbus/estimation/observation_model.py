@@ -351,10 +351,11 @@ class ObservationModel(Measurements):
             rows[self._missing] = 0.0
         inverse = self.inverse_covariance(A, variance, row_var)
         if by_sensors:
-            # a gain times noise would fit better when smaller: the regressor is what the instants beside measured
-            by_gain[:, balance, layout.draft_gain] = -(of_draft**2) * self.has_balance * self.draft_beside
+            # draft and inertia without their noise, which S^-1 r says: a gain times noise would fit better when smaller
+            noise = (inverse[:, balance] * residual).sum(1)
+            true_draft = self.has_balance * (draft - self.draft_noise * of_draft**2 * noise)
+            by_gain[:, balance, layout.draft_gain] = -of_draft * true_draft
             if self._mass_gain is not None:
-                noise = (inverse[:, balance] * residual).sum(1)
                 true_inertia = self.has_balance * (inertia - self.inertia_var * of_mass**2 * noise)
                 by_gain[:, balance, layout.latent_gains][:, self._mass_gain] -= of_mass * true_inertia
         weighed = inverse @ rows
