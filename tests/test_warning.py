@@ -14,10 +14,10 @@ import pytest
 
 from soilbus.config.model import Config
 from soilbus.decision.capability import Capability, Forecast, OverSlip
-from soilbus.decision.immobilisation import Alert, Warnings, Watch, common_slip, ended, has_cause, watched
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import TractionLoss, motion_of, observed
+from soilbus.decision.moments import Moment, Sample, common_slip, moment_of
 from soilbus.decision.traversability import State, Traversability
+from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, window_of_samples
 from soilbus.simulator.reference import reference_configuration
@@ -129,11 +129,11 @@ class Machine:
         config, rig = Config(), self.rig
         config = config.model_copy(update={"estimator": replaced(config.estimator, min_speed=self.min_speed)})
         limit = np.full(4, self.limit * self.mass * GRAVITY / 4.0 * self.radius if self.known_limit else np.nan)
-        state, begun = TractionLoss(), []
+        state, begun = Watch(), []
         for i in range(len(window.t)):
-            motion = motion_of(forward(window.rows(np.arange(max(i - 2, 0), i + 1))), rig, limit, config.traversability)
-            later = observed(state, motion, config)
-            if later.warns and not state.warns:
+            moment = moment_of(forward(window.rows(np.arange(max(i - 2, 0), i + 1))), rig, limit, config)
+            later = watched(state, moment, None, config)
+            if Alert.IMMOBILISATION is later.warning is not state.warning:
                 begun.append(float(window.t[i]))
             state = later
         return begun
@@ -224,12 +224,13 @@ def test_it_is_in_vain_where_they_have_none_left_or_a_differential_gives_them_no
 def test_a_bin_that_is_seen_twice_counts_once():
     machine = BOGGED["rover"][0]
     window, _ = machine.driven(1)
-    config, limit, once, twice = Config(), np.full(4, np.nan), TractionLoss(), TractionLoss()
+    config, limit, once, twice = Config(), np.full(4, np.nan), Watch(), Watch()
     for i in range(3, 40):
-        motion = motion_of(window.rows(np.arange(i - 2, i + 1)), machine.rig, limit, config.traversability)
-        once = observed(once, motion, config)
-        twice = observed(observed(twice, motion, config), motion, config)
-    assert twice.ahead == once.ahead
+        moment = moment_of(window.rows(np.arange(i - 2, i + 1)), machine.rig, limit, config)
+        once = watched(once, moment, CURVE, config)
+        twice = watched(watched(twice, moment, CURVE, config), moment, CURVE, config)
+    assert twice.stall == once.stall
+    assert len(twice.margin.rows) == len(once.margin.rows) > 30
 
 
 SLIPS = np.linspace(0.02, 0.6, 9)
@@ -243,9 +244,9 @@ def judged(slip: float, pull: float = math.nan):
     forecast = Forecast(Estimate(0.035, 0.003), {}, known, known, known)
     capability = Capability(known, None, None, None, known, known, "slip", {}, forecast, CURVE)
     go = Traversability(State.GO, 0.999, capability=capability, spare=known)
-    loss = TractionLoss(t=10.0, slip=slip, pull=pull)
+    watch = Watch(t=10.0, slip=slip, pull=pull)
     config = reference_configuration()
-    return at_present(go, Basis(np.linspace(0.0, 10.0, 101), 0.1), loss, 10.0, config)
+    return at_present(go, Basis(np.linspace(0.0, 10.0, 101), 0.1), watch, 10.0, config)
 
 
 def test_a_go_does_not_stand_beside_a_slip_that_its_forecast_does_not_know():
@@ -262,19 +263,25 @@ def test_where_the_pull_is_known_its_own_slip_is_what_counts():
     assert judged(0.35, pull(0.20)).contradicted == "slip"
 
 
+def look(t: float, slip: float, pull: float) -> Moment:
+    """What a vehicle of 2300 kg at 1 m/s shows while its wheels slip so much under so much draft [N]."""
+    rim, share = 1.0 / (1.0 - slip), pull / (2300.0 * GRAVITY)
+    last = Sample(t, 1.0, 1e-4, rim, 1e-4, share, draft=share)
+    return Moment(t, 1.0, [rim] * 4, 0.0, at_limit=False, last=last, common=slip, given=pull, mass=2300.0)
+
+
 def test_a_warning_that_only_lasts_ends_with_a_go_and_does_not_begin_again():
-    state = Watch()
-    for i in range(40):  # a draft grows to nearly all that there is
-        draft = 4000.0 + 30.0 * i
-        state = watched(state, 0.1 * i, [0.3 * draft / (8000.0 - draft)], draft, CURVE)
-    assert has_cause(state, TractionLoss(), 1.0)
-    for i in range(40, 70):  # and is gone
-        state = watched(state, 0.1 * i, [0.04], 1000.0, CURVE)
-    assert state.warning is Alert.IMMOBILISATION
-    assert not has_cause(state, TractionLoss(), 1.0)
-    over, log = ended(state), Warnings()
-    for i in range(70, 110):
-        over = watched(over, 0.1 * i, [0.04], 1000.0, CURVE)
+    state, config = Watch(), Config()
+    for i in range(140):  # a draft grows to nearly all that there is
+        draft = 3000.0 + 20.0 * i
+        state = watched(state, look(0.1 * i, 0.3 * draft / (8000.0 - draft), draft), CURVE, config)
+    assert (state.warning, state.is_caused) == (Alert.IMMOBILISATION, True)
+    for i in range(140, 175):  # and is gone
+        state = watched(state, look(0.1 * i, 0.04, 1000.0), CURVE, config)
+    assert (state.warning, state.is_caused) == (Alert.IMMOBILISATION, False)
+    over, log = ended(state, config), Warnings()
+    for i in range(175, 215):
+        over = watched(over, look(0.1 * i, 0.04, 1000.0), CURVE, config)
         log = log.after(0.1 * i, over.warning)
     assert log.begun == ()
 

@@ -6,7 +6,7 @@
     diagnose        what the model misses in logs
     signals         the decoded, admitted samples of a log as a table
     simulate        a drive of the reference tractor or of another one, as a log
-    paper           the tables of Xi et al. 2024 beside ours
+    paper           the tables and figures of Xi et al. 2024 by our equations
 
 Each is loaded with what it needs when it is first used (`__init__.pyi` has the types): the daemon loads none of them.
 """

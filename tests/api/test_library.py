@@ -84,6 +84,27 @@ def test_an_estimate_has_a_table_residuals_and_a_plot(columns):
     assert len(found.plot().axes) == 9
 
 
+def test_a_diagnosis_has_residuals_and_a_plot_of_held_out_readings(drive):
+    found = soilbus.diagnose(drive, TRACTOR)
+    left = found.residuals
+    assert set(left["wheel"]) >= {"FL", "RR"}
+    np.testing.assert_allclose(left["residual"], left["measured"] - left["modelled"])
+    drawn = found.plot()
+    assert [axis.get_xlabel() for axis in drawn.axes[1:3]] == ["slip", "load [N]"]
+    assert drawn._repr_png_()[1:4] == b"PNG"  # what a notebook shows
+
+
+def test_signals_of_what_has_none_are_refused_in_a_line(tmp_path, drive, columns):
+    with pytest.raises(ValueError, match="2 logs: give one"):
+        soilbus.signals([drive, drive], TRACTOR)
+    with pytest.raises(ValueError, match="test rig's table holds no signals over time"):
+        soilbus.signals(write_csv(tmp_path / "t.csv", columns), rig().configuration(columns))
+    other = tmp_path / "other.log"
+    other.write_text("(1.0) can0 123#00\n")
+    with pytest.raises(LogError, match="none of its 1 frames is in the DBC"):
+        soilbus.signals(other, TRACTOR)
+
+
 def test_signals_are_the_admitted_samples_in_si(drive):
     recording = soilbus.simulate(soil="loam", duration=14.0)
     frame = soilbus.signals(drive, TRACTOR)

@@ -52,3 +52,13 @@ def test_a_recording_becomes_a_named_effect_that_closes_the_gap_of_another(tmp_p
     assert pictures == 1
     assert "an effect is missing, and the data tell which: slip_sinkage" in text
     assert "\nnone: " in text
+
+
+def test_the_papers_figures_are_drawn_and_their_text_agrees_with_their_numbers(tmp_path, monkeypatch):
+    text, pictures = executed("paper.ipynb", tmp_path, monkeypatch)
+    assert pictures == 4
+    rows = [line.split() for line in text.splitlines()]
+    names = next(row for row in rows if row[:2] == ["parameter", "K"])[1:]
+    pull = next(row for row in rows if "drawbar_pull" in row and "clay" in row)
+    moved = dict(zip(names, map(float, pull[-len(names) :]), strict=True))
+    assert sorted(moved, key=lambda name: -abs(moved[name]))[:2] == ["n", "c"]

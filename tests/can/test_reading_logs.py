@@ -219,6 +219,14 @@ def test_the_other_channels_frames_are_counted_and_said(tmp_path: Path) -> None:
     ]
 
 
+def test_error_frames_are_of_no_other_channel(tmp_path: Path) -> None:
+    path = tmp_path / "errors.log"
+    path.write_text("(1.0) can0 123#00\n(1.1) can0 20000004#0008000000000000\n(1.2) can0 123#00\n")
+    log = Log(path, "can0")
+    assert [frame[5] for frame in log.frames()] == [False, True, False]
+    assert (log.channels, log.note, log.left_out) == ({"can0": 2}, "", 0)
+
+
 def test_check_says_of_standard_input_what_it_is() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "soilbus", "check", "--config", "tractor", "--channel", "can1", "--log", "-"],

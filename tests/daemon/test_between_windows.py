@@ -93,11 +93,11 @@ def test_a_window_that_ends_in_reverse_is_judged_so():
 
 def test_an_idle_motor_does_not_keep_the_others_from_their_limit():
     intake, last = fed(TWO_MOTORS, simulate(TWO_MOTORS, excited("loam", 8.0), seed=3))
-    torque = dict(zip(intake.rig.wheels, intake.latest(last).motion.torque, strict=True))
+    torque = dict(zip(intake.rig.wheels, intake.latest(last).moment.torque, strict=True))
     ceiling = tuple(0.9 * torque[w] if w.startswith("R") else 0.0 for w in intake.rig.wheels)
-    assert not intake.latest(last).motion.at_limit
-    assert intake.latest(last, Corrections(ceiling)).motion.at_limit
-    assert not intake.latest(last, Corrections((np.inf,) * 4)).motion.at_limit
+    assert not intake.latest(last).moment.at_limit
+    assert intake.latest(last, Corrections(ceiling)).moment.at_limit
+    assert not intake.latest(last, Corrections((np.inf,) * 4)).moment.at_limit
 
 
 def test_pitch_in_gaps_is_no_level_ground_between_windows():
@@ -108,7 +108,7 @@ def test_pitch_in_gaps_is_no_level_ground_between_windows():
     known, gone = (intake.latest(last) for intake, last in (heard, silent))
     assert known.pitch == pytest.approx(0.1, abs=0.01)
     assert gone.pitch is None
-    assert gone.pull == pytest.approx(known.pull, abs=300.0)  # the whole slope is 2200 N
+    assert gone.moment.given == pytest.approx(known.moment.given, abs=300.0)  # the whole slope is 2200 N
 
 
 def test_frames_and_lines_judge_a_corrected_draft_alike(tmp_path):

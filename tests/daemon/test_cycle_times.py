@@ -13,8 +13,8 @@ from soilbus.can.publish import Publisher
 from soilbus.cli.main import main
 from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config, ConfigError
-from soilbus.decision.immobilisation import Watch
 from soilbus.decision.traversability import Status, Traversability
+from soilbus.decision.watch import Watch
 from soilbus.pipeline.outputs import (
     FAST_FRAMES,
     HOP_FRAMES,

@@ -9,8 +9,8 @@ import pytest
 
 from soilbus.can.dbc_files import load_databases
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import State, Status, Traversability
+from soilbus.decision.watch import Watch
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
@@ -109,7 +109,7 @@ def test_ground_left_behind_is_unknown(ago, state, tasks, firm):
 @pytest.mark.parametrize(("last", "state"), [(8.0, State.GO), (9.0, State.CAUTION)])
 def test_a_little_measured_since_a_wheel_spun_is_no_go(last, state):
     basis = Basis(np.arange(0.0, 10.0, 0.1), 0.1)
-    way = at_present(Traversability(State.GO, 1.0), basis, TractionLoss(t=10.0, last=last), 10.0, CONFIG)
+    way = at_present(Traversability(State.GO, 1.0), basis, Watch(t=10.0, last=last), 10.0, CONFIG)
     assert way.state is state
 
 
@@ -124,6 +124,6 @@ def test_a_little_measured_since_a_wheel_spun_is_no_go(last, state):
 )
 def test_a_wheel_that_spins_is_caution_at_best_and_at_least(before, after):
     basis = Basis(np.arange(0.0, 10.0, 0.1), 0.1)
-    loss = TractionLoss(t=10.0, spinning=True)
+    loss = Watch(t=10.0, spinning=True)
     way = at_present(Traversability(before, None if before is State.UNKNOWN else 0.9), basis, loss, 10.0, CONFIG)
     assert way.state is after

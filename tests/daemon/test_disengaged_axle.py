@@ -15,7 +15,7 @@ import pytest
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import parse_config
 from soilbus.decision.capability import assess
-from soilbus.decision.traction_loss import idle
+from soilbus.decision.driveline import idle
 from soilbus.estimation.assembly import model_of, rig_of, with_disengaged
 from soilbus.estimation.instrumentation import completed, recompleted
 from soilbus.estimation.observation_model import ObservationModel

@@ -182,6 +182,16 @@ def test_a_blow_that_the_acceleration_tells_is_no_jump(lively):
     assert judged(_changed(lively, ground_speed=speed, acceleration=acceleration, speed=wheels)) == ()
 
 
+@pytest.mark.parametrize("wheels", [[0, 1], [2, 3], [0, 1, 2, 3]])
+def test_a_ground_speed_that_is_made_of_wheel_speeds_is_named(wheels, good):
+    window, motor = good
+    rim = (RIG.radius * window.speed)[:, wheels].mean(axis=1)
+    assert judged(_changed(window, ground_speed=rim), motor) == ("ground_speed",)
+    traction = window.torque / (RIG.radius * window.load)
+    on_asphalt = (window.ground_speed / (1.0 - traction.T / 20.0) / RIG.radius[:, None]).T
+    assert judged(_changed(window, speed=on_asphalt), on_asphalt) == ()
+
+
 def test_what_does_not_last_or_is_not_driven_is_not_judged(good):
     window, motor = good
     speed = window.speed.copy()

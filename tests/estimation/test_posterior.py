@@ -118,23 +118,6 @@ def test_derived_quantities_have_the_sd_of_monte_carlo(seed):
     assert posterior.propagate(tyre_modulus(posterior.soil, 0.26).gradient) == pytest.approx(modulus.std(), rel=0.03)
 
 
-@pytest.mark.parametrize("factor", [1.0, 4.0, 1e3, 1e12])
-def test_widening_divides_the_information_of_the_data_and_not_of_the_prior(factor):
-    rng = np.random.default_rng(3)
-    prior = SoilPrior(np.array([6e3, 8e5, 0.6, 0.4, 3e3, 0.02]), np.array([1.27, 1.19, 0.6, 0.47, 0.0, 0.47]))
-    free = prior.log_std > 0.0
-    of_prior = np.diag(prior.log_std[free] ** -2.0)
-    rows = rng.normal(size=(3, 5)) * 20.0  # the data determine three directions of five
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = np.linalg.inv(of_prior + rows.T @ rows)
-    posterior = Posterior(Soil(*prior.median.tolist()), covariance)
-    widened = posterior.widened(factor, prior)
-    expected = np.linalg.inv(of_prior + rows.T @ rows / factor)
-    np.testing.assert_allclose(widened.log_covariance[np.ix_(free, free)], expected, rtol=1e-6, atol=1e-9)
-    assert widened.log_covariance[4].tolist() == [0.0] * 6
-    assert widened.soil == posterior.soil
-
-
 def test_an_added_covariance_adds_up_and_never_exceeds_the_prior():
     rng = np.random.default_rng(5)
     prior = SoilPrior(np.ones(6), np.array([0.8, 0.5, 0.0, 0.4, 0.6, 0.3]))

@@ -10,7 +10,8 @@ import pytest
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import gain_errors, prior_from_last_run
+from soilbus.estimation.last_run import prior_from_last_run
+from soilbus.estimation.tracker import gain_errors
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -7,8 +7,8 @@ import pytest
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.config.model import Config
-from soilbus.decision.immobilisation import Warnings
 from soilbus.decision.traversability import Status, Traversability
+from soilbus.decision.watch import Warnings
 from soilbus.offline.replay import replay
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult

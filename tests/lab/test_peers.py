@@ -13,7 +13,7 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
 from tests.lab.peers import finite_differences, kalman, linear, newton_raphson, ours
 from tests.lab.peers.__main__ import main
-from tests.lab.peers.compare import compared, ours_is_ahead, tables, verdict
+from tests.lab.peers.compare import compared, comparison, ours_is_ahead, verdict
 from tests.lab.peers.roster import OURS, Entry, roster
 from tests.lab.peers.scores import Duel, Score, duel, truth
 from tests.lab.peers.windows import assumed_of, configured_prior, simulated_case
@@ -113,8 +113,7 @@ def test_ours_recovers_the_truth_from_exact_readings(name, quiet):
 
 def rms(scores, entry, quantity) -> float:
     """Over the windows of all soils; a failure counts as being off by everything."""
-    errors = np.concatenate([of_soil[entry].errors(quantity) for of_soil in scores.values()])
-    return float(np.sqrt(np.mean(np.nan_to_num(errors, nan=1.0) ** 2)))
+    return float(np.sqrt(np.mean(np.nan_to_num(scores[entry].errors(quantity), nan=1.0) ** 2)))
 
 
 def test_ours_is_closer_than_every_peer_on_noisy_windows(scores, entries):
@@ -124,7 +123,7 @@ def test_ours_is_closer_than_every_peer_on_noisy_windows(scores, entries):
     for peer in entries:
         if peer.name == OURS:
             continue
-        for quantity in scores["loam"][peer].quantities:
+        for quantity in scores[peer].quantities:
             assert rms(scores, mine[peer.exact], quantity) < rms(scores, peer, quantity), (peer, quantity)
             compared_ += 1
     assert compared_ == 2 * 2 + 2 * 3 + 2 * 3
@@ -132,8 +131,8 @@ def test_ours_is_closer_than_every_peer_on_noisy_windows(scores, entries):
 
 def test_ours_never_fails_and_covers_the_truth(scores, entries):
     plain = next(e for e in entries if e.name == OURS and not e.exact)
-    assert [of_soil[plain].failure_rate for of_soil in scores.values()] == [0.0] * 3
-    covered = [of_soil[plain].coverage(q) for of_soil in scores.values() for q in ("bearing", "phi", "n", "c", "K")]
+    assert scores[plain].failure_rate == 0.0
+    covered = [scores[plain].coverage(q) for q in ("bearing", "phi", "n", "c", "K")]
     assert np.mean(covered) > 0.8  # 30 intervals of six windows
 
 
@@ -144,36 +143,54 @@ def answers_of(*values: float, std: float = np.nan) -> list:
 LOAM = SOILS["loam"]
 
 
+def score_of(answers: list, seconds: float) -> Score:
+    return Score([LOAM] * len(answers), answers, [seconds] * len(answers))
+
+
 def test_scores_by_hand():
-    score = Score(LOAM, [*answers_of(1.1, 0.7, -1.0, std=0.1), None], [0.001, 0.002, 0.003, 0.010])
+    score = Score([LOAM] * 4, [*answers_of(1.1, 0.7, -1.0, std=0.1), None], [0.001, 0.002, 0.003, 0.010])
     assert score.quantities == ["phi"]
     assert score.failure_rate == 0.5
     assert score.rms("phi") == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2.0))
     assert score.median("phi") == pytest.approx(0.2)
     assert score.milliseconds == pytest.approx(2.5)
-    assert Score(LOAM, answers_of(1.1, 0.7, std=0.1), [0.0] * 2).coverage("phi") == 0.5
-    assert np.isnan(Score(LOAM, answers_of(1.1, 0.7), [0.0] * 2).coverage("phi"))
+    assert score_of(answers_of(1.1, 0.7, std=0.1), 0.0).coverage("phi") == 0.5
+    assert np.isnan(score_of(answers_of(1.1, 0.7), 0.0).coverage("phi"))
 
 
-def test_a_peer_that_is_better_is_said_to_be():
+def test_each_window_is_scored_by_its_own_soil():
+    sand = SOILS["dry_sand"]
+    both = Score([LOAM, sand], [{"phi": Estimate(s.phi, 0.01 * s.phi)} for s in (LOAM, sand)], [0.0] * 2)
+    assert (both.rms("phi"), both.coverage("phi")) == (0.0, 1.0)
+
+
+def test_a_peer_that_is_closer_is_said_to_be():
     off_by = np.linspace(0.05, 0.10, 12)
-    good = Score(LOAM, answers_of(*(1.0 + off_by / 2.0)), [0.001] * 12)
-    bad = Score(LOAM, answers_of(*(1.0 - off_by)), [0.002] * 12)
+    good, bad = score_of(answers_of(*(1.0 + off_by / 2.0)), 0.001), score_of(answers_of(*(1.0 - off_by)), 0.002)
     won = duel(good, bad, "phi")
-    assert (won.better, won.by_chance) == ("peer", False)
+    assert (won.closer, won.closer_in, won.windows) == ("peer", 12, 12)
     assert won.peer == pytest.approx(won.ours / 2.0)
-    assert duel(bad, good, "phi").better == "ours"
-    assert Duel(1.0, 1.01, 1e-6).better == "neither"
+    assert duel(bad, good, "phi").closer == "ours"
+    one = duel(score_of([*answers_of(1.0), *[None] * 11], 0.001), bad, "phi")
+    assert (one.closer_in, one.windows) == (1, 12)
     mine, peer = Entry(OURS, ours.estimate), Entry("a peer", ours.estimate, note="something")
-    said = verdict({"loam": {mine: bad, peer: good}})
-    assert "phi 3.8 < 7.7" in said
-    assert "a peer in 1 (" in said
-    assert "Faster: a peer 1 ms" in said
-    assert "nowhere" in verdict({"loam": {mine: good, peer: bad}})
-    failing = Score(LOAM, [*answers_of(*(1.0 + off_by[1:] / 2.0)), None], [0.001] * 12)
-    ahead = [ours_is_ahead({"loam": {mine: m, peer: p}}) for m, p in ((bad, good), (good, bad), (failing, bad))]
-    assert ahead == [False, True, False]
-    assert "7.7 / 7.5" in "".join(tables({"loam": {mine: bad}}))
+    assert verdict({mine: bad, peer: good}).startswith("Of 1 comparisons ours is closer in 0, a peer in 1;")
+    assert "3.8 / 3.7 peer" in comparison({mine: bad, peer: good})
+    assert "7.7 / 7.5 ours" in comparison({mine: good, peer: bad})
+    failing = score_of([*answers_of(*(1.0 + off_by[1:] / 2.0)), None], 0.001)
+    ahead = [ours_is_ahead({mine: m, peer: p}) for m, p in ((bad, good), (good, bad), (failing, bad), (good, good))]
+    assert ahead == [False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("peer", "mine", "closer_in", "windows", "closer"),
+    [
+        (1.0, 1.01, 12, 12, "alike"), (1.0, 2.0, 6, 6, "peer"), (2.0, 1.0, 0, 6, "ours"),
+        (1.0, 2.0, 5, 5, "open"), (1.0, 2.0, 10, 20, "open"), (1.0, 2.0, 0, 20, "open"),
+    ],
+)  # fmt: skip
+def test_only_what_windows_confirm_is_decided(peer, mine, closer_in, windows, closer):
+    assert Duel(peer, mine, closer_in, windows).closer == closer
 
 
 def test_what_is_told_is_off_by_a_quarter():
@@ -189,6 +206,6 @@ def test_what_is_told_is_off_by_a_quarter():
 
 def test_the_command_says_what_is_wrong_with_its_options(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["--windows", "0"])
+        main(["--windows", "1"])
     assert end.value.code == 2
-    assert "at least 1 window" in capsys.readouterr().err
+    assert "at least 2 windows" in capsys.readouterr().err

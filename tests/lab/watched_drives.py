@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
-from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched, with_loss
+from soilbus.decision.moments import Moment, bins_of_a_moment, moments
 from soilbus.decision.options import WATCH, WatchOptions
-from soilbus.decision.traction_loss import TractionLoss, bins_of_a_moment, motions, slope_felt
-from soilbus.decision.traction_loss import observed as loss_after
+from soilbus.decision.watch import Alert, Watch, watched
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward
@@ -33,14 +32,14 @@ class Observation(NamedTuple):
         What the watch reads at each look.
     curves
         Times [s] from which on a curve of pull over slip is known, and the curve.
-    losses
-        What wheels and vehicle do at each look, without any soil; empty where it is not looked at.
+    config
+        Of the vehicle.
     """
 
     drive: Drive
     moments: list[Moment]
     curves: list[tuple[float, OverSlip]]
-    losses: Sequence[TractionLoss] = ()
+    config: Config = Config()
 
 
 def observed(task: Task) -> Observation:
@@ -56,27 +55,19 @@ def observed(task: Task) -> Observation:
         if result.curve is not None:
             curves.append((due, result.curve))
     seen = completed(forward(store.window(0.0, drive.end)), rig)
-    losses, loss, bins, ends = [], TractionLoss(), bins_of_a_moment(settings.bin), np.arange(len(seen.t))
-    for motion in motions(seen, rig, limit, config.traversability, ends, bins):
-        loss = loss_after(loss, motion, config)
-        losses.append(loss)
-    looks = [
-        moment._replace(inertia=moment.inertia - slope_felt(loss, rig))
-        for moment, loss in zip(moments(seen, rig, ends, bins, settings.min_speed), losses, strict=True)
-    ]
-    return Observation(drive, looks, curves, losses)
+    bins, ends = bins_of_a_moment(settings.bin), np.arange(len(seen.t))
+    return Observation(drive, moments(seen, rig, limit, config, ends, bins), curves, config)
 
 
 def watch(observation: Observation, options: WatchOptions = WATCH) -> tuple[Array, NDArray[np.bool_]]:
     """Times [s] (N,) of the looks, and whether each warned."""
     state, curve, curves, out = Watch(), None, iter(observation.curves), []
     due = next(curves, None)
-    losses = observation.losses or [TractionLoss()] * len(observation.moments)
-    for moment, loss in zip(observation.moments, losses, strict=True):
+    for moment in observation.moments:
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
-        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia, options)
-        out.append((moment.t, with_loss(state, loss).warning is Alert.IMMOBILISATION))
+        state = watched(state, moment, curve, observation.config, options)
+        out.append((moment.t, state.warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
 

@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
 import pytest
 from cantools.database.can import Database
 
+import soilbus
 from soilbus.can.bus import heard_for
 from soilbus.can.candump import Frame, frame_of
 from soilbus.can.dbc_files import load_databases
@@ -28,14 +30,21 @@ from soilbus.pipeline.intake import Intake
 from soilbus.sensors.survey import Survey, survey
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over
-from soilbus.simulator.recording import simulate
+from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import AXLE_MOTORS, REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 WHEELS = ("FL", "FR", "RL", "RR")
-LEVEL = "the slope hardly changes: the sign of signals.pitch cannot be decided"
+LEVEL = (
+    "the slope hardly changes: the sign and scale of signals.pitch and the kind of signals.acceleration cannot be"
+    " decided: drive up and down a slope"
+)
 """What every drive on level ground leaves open."""
+RADII = (
+    "radius and slip cannot be told apart, 5 % of radius is 0.05 of slip: roll a minute without draft on firm ground"
+)
+"""What every drive that pulls leaves open."""
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +105,7 @@ def test_the_field_vehicle_is_configured_without_fault(name, field_frames):
     found = beside(load_config(FIELD), field_frames(name))
     assert found.findings == ()
     asked = [line for line in found.open if "sinkage: not in this recording" not in line]  # fitted in one of them only
-    assert asked == [LEVEL]
+    assert asked == [LEVEL, RADII]
     assert all(s.count > 2900 and math.isfinite(s.rate) for s in found.seen if s.channel.quantity != "sinkage")
 
 
@@ -116,7 +125,7 @@ def test_the_field_vehicle_is_configured_without_fault(name, field_frames):
 def test_drives_and_what_models_miss_are_no_mistakes_of_mapping(soils, seed, effects):
     found = beside(reference_configuration(), driven(soils, seed, 30.0, effects))
     assert found.findings == ()
-    assert [line for line in found.open if "the draft hardly changes" not in line] == [LEVEL]
+    assert [line for line in found.open if "the draft hardly changes" not in line] == [LEVEL, RADII]
 
 
 # --- mistakes in the configuration ---
@@ -528,6 +537,107 @@ def on_hills(path: Path, slope: Sequence[tuple[float, float]]) -> list[Frame]:
     return [frame_of(message) for message in frames(simulate(config, scenario, 5), config)]
 
 
+def with_changed(
+    change: Callable[[Recording], dict[str, Any]], slope: Sequence[tuple[float, float]] = (), path: Path = TRACTOR
+) -> list[Frame]:
+    """60 s of a machine on loam whose channels of these names read these values instead."""
+    config = reference_configuration(path=path)
+    drive = Scenario(60.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3), slope=slope or ((0.0, 0.0),))
+    recording = simulate(config, drive, 5)
+    channels = recording.channels | {n: replace(recording.channels[n], value=v) for n, v in change(recording).items()}
+    return [frame_of(message) for message in frames(replace(recording, channels=channels), config)]
+
+
+HILLS = tuple((4.0 * i, 0.08 * (-1.0) ** i) for i in range(30))
+
+
+def of_wheels(recording: Recording, wheels: Sequence[str] = WHEELS) -> dict[str, Any]:
+    """The ground speed that a controller computes from these wheels."""
+    ground = recording.channels["ground_speed"]
+    rims = [
+        np.interp(ground.t, own.t, own.value) * radius
+        for own, radius in ((recording.channels[f"speed.{w}"], 0.5 if w[0] == "F" else 0.62) for w in wheels)
+    ]
+    return {"ground_speed": np.mean(rims, axis=0)}
+
+
+def scaled(name: str, factor: float) -> Callable[[Recording], dict[str, Any]]:
+    return lambda recording: {name: factor * recording.channels[name].value}
+
+
+@pytest.mark.parametrize(
+    ("change", "slope", "says"),
+    [
+        (of_wheels, (), "signals.ground_speed: goes with the "),
+        (lambda r: of_wheels(r, ("RL", "RR")), (), "signals.ground_speed: goes with the rear wheels"),
+        (scaled("draft", 0.1), (), "scale of the draft"),
+        (scaled("draft", 1.0 / 9.80665), (), "kgf or daN where the DBC says N"),
+        (scaled("acceleration", 10.0), (), "signals.acceleration: changes"),
+        (scaled("acceleration", 0.1), (), "signals.acceleration: changes 0.1 times"),
+    ],
+)
+def test_a_scale_that_other_sensors_contradict_is_named(change, slope, says):
+    right = beside(reference_configuration(), with_changed(lambda recording: {}, slope))
+    assert right.findings == ()
+    found = beside(reference_configuration(), with_changed(change, slope))
+    assert [fault for fault in found.faults if says in fault], (found.faults, found.open)
+
+
+def of_gravity(factor: float) -> Callable[[Recording], dict[str, Any]]:
+    """An accelerometer that feels the slope, and a pitch sensor of this scale."""
+
+    def change(recording: Recording) -> dict[str, Any]:
+        pitch, own = recording.channels["pitch"], recording.channels["acceleration"]
+        gravity = 9.80665 * np.sin(np.interp(own.t, pitch.t, pitch.value))
+        return {"acceleration": own.value + gravity, "pitch": factor * pitch.value}
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("factor", "kind", "says"),
+    [
+        (1.0, "kinematic", 'which dv/dt does not: kind = "specific_force"?'),
+        (3.0, "specific_force", "signals.pitch: the accelerometer feels 0.3"),
+        (0.2, "specific_force", "signals.pitch: the accelerometer feels 5 times"),
+        (-1.0, "specific_force", "signals.pitch: the accelerometer feels it the other way"),
+    ],
+)
+def test_an_accelerometer_that_feels_the_slope_tells_kind_and_pitch(factor, kind, says):
+    force = reference_configuration(["signals.acceleration.kind=specific_force"])
+    assert beside(force, with_changed(of_gravity(1.0), HILLS)).findings == ()
+    config = reference_configuration([f"signals.acceleration.kind={kind}"])
+    found = beside(config, with_changed(of_gravity(factor), HILLS))
+    assert [fault for fault in found.faults if says in fault], (found.faults, found.open)
+
+
+def test_an_accelerometer_without_gravity_said_to_feel_it_is_named():
+    config = reference_configuration(["signals.acceleration.kind=specific_force"])
+    heard = with_changed(lambda recording: {}, HILLS)
+    assert beside(reference_configuration(), heard).findings == ()
+    assert any('kind = "kinematic"' in fault for fault in beside(config, heard).faults)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.0 / 9.80665])
+def test_loads_in_kg_are_named_where_one_axle_alone_is_weighed(factor):
+    heard = with_changed(scaled("load.rear", factor), (), REAR_DRIVE)
+    faults = beside(reference_configuration(path=REAR_DRIVE), heard).faults
+    named = [fault for fault in faults if "axle.rear.load" in fault and "are the loads in kg, not in N?" in fault]
+    assert bool(named) == (factor < 1.0), faults
+
+
+def test_wheels_that_roll_without_thrust_tell_their_radii():
+    road = soilbus.Soil(k_c=0.0, k_phi=3e8, n=1.0, phi=0.9, c=5e4, K=0.002)
+    config = reference_configuration()
+    drive = Scenario(40.0, (Patch(0.0, "road", road),), draft=Swing(0.0, 0.0))
+    rolls = [frame_of(message) for message in frames(simulate(config, drive, 5), config)]
+    right = beside(config, rolls)
+    assert right.findings == ()
+    assert RADII not in right.open
+    (finding,) = beside(reference_configuration(["wheel.RL.radius=0.66"]), rolls).findings
+    assert finding.text == "wheel.RL: slips by 0.06 where nothing is pulled: its radius?"
+
+
 def test_a_slope_that_only_a_specific_force_shows_contradicts_nothing():
     found = beside(reference_configuration(path=AXLE_MOTORS), on_hills(AXLE_MOTORS, ((0.0, 0.10),)))
     assert found.findings == ()
@@ -537,12 +647,12 @@ def test_a_slope_that_only_a_specific_force_shows_contradicts_nothing():
 def test_hills_show_the_sign_of_the_pitch_and_level_ground_says_that_it_does_not(clay_drive):
     hills = on_hills(TRACTOR, [(4.0 * i, 0.08 * (-1.0) ** i) for i in range(20)])
     assert beside(reference_configuration(), hills).findings == ()
-    assert beside(reference_configuration(), hills).open == ()
+    assert beside(reference_configuration(), hills).open == (RADII,)
     turned = reference_configuration(["signals.pitch.sign=-1"])
     assert any(line.startswith("signals.pitch: ") for line in beside(turned, hills).faults)
     level = beside(turned, clay_drive)
     assert level.findings == ()
-    assert level.open == (LEVEL,)
+    assert level.open == (LEVEL, RADII)
 
 
 def test_a_torque_of_an_axle_that_brakes_is_named_by_its_key():

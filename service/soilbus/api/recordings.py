@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from soilbus.api.residuals import frame_of, plot_residuals
-from soilbus.can.admission import Admission
-from soilbus.can.dbc_files import checked_messages, load_databases
+from soilbus.api.residuals import frame_of, plot_residuals, with_pandas
+from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
-from soilbus.can.mapping import channels_of
 from soilbus.config.edit import with_effects_text
 from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config
@@ -23,9 +20,10 @@ from soilbus.diagnosis.model_out import effect_tables
 from soilbus.estimation.assembly import with_effects
 from soilbus.files import whole_file
 from soilbus.offline.diagnose import Findings, diagnose_logs
-from soilbus.offline.replay import log_of
+from soilbus.offline.replay import fed
 from soilbus.offline.replay import replay as replay_logs
 from soilbus.offline.tables import replay_tables
+from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.outputs import column_names, flat_record, window_record
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.report.findings import findings_record, findings_text
@@ -92,7 +90,7 @@ def replay(log: Logs, config: Config | PathLike) -> Any:
     rows = [flat_record(window_record(result, used)) for result in results]
     if find_spec("pandas") is None:
         return rows
-    return import_module("pandas").DataFrame(rows, columns=column_names(rows))
+    return frame_of(rows, column_names(rows))
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,7 +139,7 @@ class Diagnosis:
             })
             for series in self.findings.diagnosis.completed.held_out_series()
         ]  # fmt: skip
-        return import_module("pandas").concat(parts, ignore_index=True)
+        return with_pandas().concat(parts, ignore_index=True)
 
     def to_frame(self) -> Any:
         """pandas DataFrame: probability, and value and std of each parameter, of the effects found."""
@@ -230,7 +228,7 @@ def signals(log: Logs, config: Config | PathLike) -> Any:
     Parameters
     ----------
     log
-        A recording, as of `replay`.
+        One recording, as of `replay`.
     config
         Configuration, or the path of one.
 
@@ -238,12 +236,14 @@ def signals(log: Logs, config: Config | PathLike) -> Any:
     -------
     pandas.DataFrame
         A column for each channel, its SI unit behind its name: `torque.FL [N.m]`; `attrs["units"]` has them, too.
-        The index is the time [s]; nan where a channel has no sample then.
+        The index is the time [s]; nan where a channel has no sample then. Of two samples at one time the first.
 
     Raises
     ------
     LogError, ConfigError
         As `replay`.
+    ValueError
+        Several logs, or a configuration of a test rig, whose tables hold no signals over time.
 
     Examples
     --------
@@ -257,17 +257,19 @@ def signals(log: Logs, config: Config | PathLike) -> Any:
     ('N', 250)
     """
     used = _config(config)
-    database = load_databases(used)
-    admission = Admission(channels_of(used, database), database, checked_messages(used, database))
-    with _paths(log) as (path,):
-        for t, identifier, extended, data, remote, error in log_of(used, path).frames():
-            if not error:
-                admission.feed(t, identifier, extended, data, remote)
-    pandas = import_module("pandas")
-    units = {channel.name: si_unit(channel) for channel in channels_of(used, database)}
+    if used.table is not None:
+        raise ValueError("a test rig's table holds no signals over time: read it with pandas")
+    intake = Intake(used, load_databases(used))
+    with _paths(log) as paths:
+        if len(paths) != 1:
+            raise ValueError(f"{len(paths)} logs: give one, and put the tables together with pandas.concat")
+        for _ in fed(intake, paths[0]):
+            pass
+    pandas = with_pandas()
+    units = {channel.name: si_unit(channel) for channel in intake.channels}
     found = {
         f"{name} [{units[name]}]" if units[name] else name: pandas.Series(column.value, column.t)
-        for name, column in admission.take().columns.items()
+        for name, column in intake.admission.take().columns.items()
     }
     frame = pandas.concat({name: one[~one.index.duplicated()] for name, one in found.items()}, axis=1).sort_index()
     frame.index.name, frame.attrs["units"] = "t [s]", units

@@ -3,18 +3,39 @@
 from __future__ import annotations
 
 from importlib import import_module
+from io import BytesIO
 from typing import Any
 
-__all__ = ["frame_of", "plot_residuals"]
+__all__ = ["blank_figure", "frame_of", "plot_residuals", "with_pandas"]
+
+
+def with_pandas() -> Any:
+    """The module pandas; ImportError says how to get it."""
+    try:
+        return import_module("pandas")
+    except ModuleNotFoundError:
+        raise ImportError("a table needs pandas: pip install pandas") from None
 
 
 def frame_of(rows: Any, columns: Any = None) -> Any:
-    """A pandas DataFrame of rows; ImportError says how to get pandas."""
+    """A pandas DataFrame of rows."""
+    return with_pandas().DataFrame(rows, columns=columns)
+
+
+def blank_figure(width: float, height: float) -> Any:
+    """A figure of matplotlib [inch] without axes, which a notebook shows; ImportError says how to get matplotlib."""
     try:
-        pandas = import_module("pandas")
+        figure: Any = import_module("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
     except ModuleNotFoundError:
-        raise ImportError("a table needs pandas: pip install pandas") from None
-    return pandas.DataFrame(rows, columns=columns)
+        raise ImportError("a plot needs the extra soilbus[plots]") from None
+
+    def png() -> bytes:
+        out = BytesIO()
+        figure.savefig(out, format="png")
+        return out.getvalue()
+
+    figure._repr_png_ = png  # for notebooks that have not imported pyplot
+    return figure
 
 
 def plot_residuals(residuals: Any) -> Any:
@@ -29,12 +50,8 @@ def plot_residuals(residuals: Any) -> Any:
     -------
     matplotlib.figure.Figure
     """
-    try:
-        figure_of: Any = import_module("matplotlib.figure").Figure
-    except ModuleNotFoundError:
-        raise ImportError("a plot needs the extra soilbus[plots]") from None
     channels = list(dict.fromkeys(residuals["channel"]))
-    figure = figure_of(figsize=(10.0, 3.0 * len(channels)), layout="constrained")
+    figure = blank_figure(10.0, 3.0 * len(channels))
     for row, channel in zip(figure.subplots(len(channels), 3, squeeze=False), channels, strict=True):
         own = residuals[residuals["channel"] == channel]
         row[0].plot(own["modelled"], own["measured"], ".")

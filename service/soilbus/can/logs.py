@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from io import BufferedReader
 from itertools import pairwise
 from pathlib import Path
@@ -176,7 +176,10 @@ class Log:
             if frames:
                 first = frames[0][0] if math.isnan(first) else first
                 self.span = max(self.span, max(frame[0] for frame in frames) - first)
-            self.channels.update(channels)
+            named: Iterable[str] = channels
+            if "" in channels:  # error frames of candump, whose reader keeps no channel
+                named = (channel for channel, frame in zip(channels, frames, strict=True) if channel or not frame[5])
+            self.channels.update(named)
             within_ratio(size, LEAST_FRAME * self.channels.total())
             yield channels, frames
 
@@ -205,7 +208,8 @@ class Log:
         self._given += len(frames)
         if not self.wanted or set(channels) <= {self.chosen}:
             return frames
-        return [frame for channel, frame in zip(channels, frames, strict=True) if channel == self.chosen]
+        pairs = zip(channels, frames, strict=True)
+        return [frame for channel, frame in pairs if channel == self.chosen or (frame[5] and not channel)]
 
 
 def read_frames(path: Path, channel: str = "") -> Iterator[Frame]:

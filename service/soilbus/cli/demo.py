@@ -1,9 +1,8 @@
 """`soilbus demo`: a simulated tractor, the service and a dashboard, without hardware.
 
-Three parties share one bus: the tractor's ECUs (simulator) send, the service estimates, the dashboard reads only the
-service's frames. The bus is a vcan where the kernel has it, else python-can's in-process virtual bus. The simulated
-drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.  Each
-frame carries the time at which it is due.
+All frames are on one bus: the tractor's, which the service hears, and the service's, which the dashboard reads.  The
+bus is a vcan where the kernel has it, else python-can's in-process virtual bus.  The drive plays SPEED times as fast as
+it is driven.  The service runs on the drive's time, which waits for a machine that is busy.
 
     soilbus demo --picture service/docs/dashboard.svg     draws the README's pictures: dashboard.svg, the driver's page
                                                           at the end of the drive, and dashboard-engineer.svg
@@ -17,39 +16,37 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import can
 from rich.console import Console, Group
 
-from soilbus.can.bus import BusError, LiveBus, open_bus
+from soilbus.can.bus import BusError, open_bus
+from soilbus.can.candump import Frame
 from soilbus.can.channels import Column
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config.model import Config
-from soilbus.daemon.start import start_service
 from soilbus.files import write_text
+from soilbus.offline.sent_frames import sent_beside
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.table import table
 from soilbus.report.watch import page, show
 from soilbus.simulator.frames import frames
-from soilbus.simulator.play import send_in_time
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import demo as demo_scenario
 
-TIME_COMPRESSION = 8.0
+SPEED = 8.0
 """Seconds of the simulated drive per second."""
 SEED = 1
 """Picks the simulated drive."""
 PICTURE_SIZE = 80, 24
 """Columns and rows of the pictures."""
-_STAMPED_BY_SENDER = {"preserve_timestamps": True}
-"""Setting of python-can's virtual bus: frames keep the stamps of their sender. A vcan ignores it and stamps them."""
 STORY_PERIOD = 4.0
 """Time [s] of the simulated drive between two rows of the table at the end."""
 
@@ -62,29 +59,20 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
     console = Console()
     real = reference_configuration()
     recording = simulate(real, demo_scenario(duration), SEED)
-    messages = _from_now_on(frames(_every_second(recording), real))
     results: list[WindowResult] = []
     with _bus_settings() as overrides, _without_journal():
         where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
-        console.print(
-            f"Simulated tractor on {where}: loam, then wet clay; {TIME_COMPRESSION:.0f} times as fast as real time."
-        )
-        config = reference_configuration(overrides + _compressed(real))
+        console.print(f"Simulated tractor on {where}: loam, then wet clay; {SPEED:.0f} times as fast as real time.")
+        config = reference_configuration(overrides)
         ours = output_database(config)
         bus = config.bus.model_dump()
-        ear = LiveBus(lambda: open_bus(bus, filters_of(ours)), time.monotonic, time.sleep)
-        with open_bus(bus | _STAMPED_BY_SENDER, []) as tractor, closing(ear):
-            ear.open()
-            service = start_service(config, wait=False, on_window=results.append, rehearse=False)
-            sender = threading.Thread(target=send_in_time, args=(messages, tractor.send), daemon=True)
-            worker = threading.Thread(target=service.run, daemon=True)
-            worker.start()
-            sender.start()
-            dashboard = Dashboard(ReceivedFrames(ours), Vehicle.of(config), span=duration / TIME_COMPRESSION)
-            show(dashboard, ear, console, done=lambda: not (sender.is_alive() or service.has_open_windows))
+        with open_bus(bus, []) as tractor, open_bus(bus, []) as node, open_bus(bus, filters_of(ours)) as ear:
+            drive = _Drive(list(frames(_every_second(recording), real)), tractor, ear)
+            service = threading.Thread(target=_serve, args=(config, drive.heard(), node, results), daemon=True)
+            service.start()
+            dashboard = Dashboard(ReceivedFrames(ours, drive.now), Vehicle.of(config), span=duration)
+            show(dashboard, drive, console, done=lambda: not service.is_alive())
             pictures = {name: page(dashboard, name, *PICTURE_SIZE) for name in ("driver", "engineer")}
-            service.stop()
-            worker.join(timeout=2.0)
     if picture is not None:
         for name, path in (("driver", picture), ("engineer", picture.with_stem(f"{picture.stem}-engineer"))):
             write_text(path, _svg(pictures[name]))
@@ -111,35 +99,40 @@ def _every_second(recording: Recording) -> Recording:
     return replace(recording, channels=kept)
 
 
-def _from_now_on(messages: Iterable[can.Message]) -> Iterator[can.Message]:
-    """Messages of the compressed drive, stamped as they are due; the first is due when it is asked for.
+class _Drive:
+    """The drive on the bus, in its own time: the tractor's messages, and what the dashboard receives meanwhile."""
 
-    A machine with other work sends some late, but the service still reads when they were due.
-    """
-    first: float | None = None
-    begin = 0.0
-    for message in messages:
-        if first is None:
-            first, begin = message.timestamp, time.time()
-        message.timestamp = begin + (message.timestamp - first) / TIME_COMPRESSION
-        yield message
+    fault = ""
+
+    def __init__(self, messages: Sequence[can.Message], tractor: can.BusABC, ear: can.BusABC) -> None:
+        self._messages, self._tractor, self._ear = messages, tractor, ear
+        self._begin = self._now = messages[0].timestamp
+
+    def now(self) -> float:
+        """Time [s] of the drive: of the tractor's last message."""
+        return self._now
+
+    def heard(self) -> Iterator[Frame]:
+        """Send the tractor's messages when they are due; yields each as the service hears it."""
+        began = time.monotonic()
+        for message in self._messages:
+            time.sleep(max(0.0, began + (message.timestamp - self._begin) / SPEED - time.monotonic()))
+            self._now = message.timestamp
+            self._tractor.send(message)
+            yield message.timestamp, message.arbitration_id, message.is_extended_id, bytes(message.data), False, False
+
+    def receive(self, timeout: float) -> can.Message | None:
+        """The next message for the dashboard, or None after `timeout` [s]."""
+        message = self._ear.recv(timeout)
+        if message is not None:
+            message.timestamp = self._now
+        return message
 
 
-def _compressed(config: Config) -> list[str]:
-    """Overrides that shorten the service's times as the tractor's time is shortened.
-
-    And the vehicle's lengths with them: it drives past a border in so much less time, and
-    loads only know their ratios.
-    """
-    sizes = {
-        "estimator.window": config.estimator.window,
-        "estimator.hop": 2.0 * config.estimator.hop,
-        "estimator.bin": config.estimator.bin,
-    }
-    if config.vehicle is not None:
-        lengths = config.vehicle.model_dump(exclude={"mass", "mass_std"}, exclude_none=True)
-        sizes |= {f"vehicle.{name}": length for name, length in lengths.items() if isinstance(length, float)}
-    return [f"{key}={size / TIME_COMPRESSION}" for key, size in sizes.items()]
+def _serve(config: Config, heard: Iterator[Frame], node: can.BusABC, results: list[WindowResult]) -> None:
+    """Run the service on the frames that it hears and send its own."""
+    for message in sent_beside(config, heard, results.append):
+        node.send(message)
 
 
 @contextmanager
@@ -187,7 +180,7 @@ def _story(results: list[WindowResult]) -> str:
     rows, due = [], 0.0
     start = results[0].t if results else 0.0
     for r in results:
-        t = (r.t - start) * TIME_COMPRESSION
+        t = r.t - start
         if t + 1e-6 < due:
             continue
         due = t + STORY_PERIOD

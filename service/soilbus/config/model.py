@@ -703,10 +703,10 @@ class Estimator(_Section):
     soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
-    """Samples are averaged over bins of this length before the fit; by default 0.04 s where wheels share a torque
-    behind an open or limited differential.  There the lighter wheel slips more, at 1.5 to 3 Hz, and torque at a mean
-    slip is not the mean torque: with loads that shake by 12 %, 73 to 87 % of the intervals of n hold with 0.1 s, 87 to
-    100 % with 0.04 s (`python -m tests.lab.computed_loads`)."""
+    """Samples are averaged over bins of this length, which the watch follows and the fit averages over 0.25 s; by
+    default 0.04 s where wheels share a torque behind an open or limited differential.  There the lighter wheel slips
+    more, at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque: with loads that shake by 12 %, 73 to 87 % of
+    the intervals of n hold with 0.1 s, 87 to 100 % with 0.04 s (`python -m tests.lab.computed_loads`)."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15

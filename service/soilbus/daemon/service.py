@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
-from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
@@ -34,10 +33,10 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
-from soilbus.decision.immobilisation import Alert, Watch, ended, has_cause, watched, with_loss
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import NO_LOSS, observed, slope_felt
+from soilbus.decision.options import WATCH
 from soilbus.decision.traversability import State, Status, Traversability
+from soilbus.decision.watch import Alert, Watch, ended, seen_at, watched
 from soilbus.pipeline.corrections import NO_CORRECTIONS
 from soilbus.pipeline.intake import Latest, input_rejected
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
@@ -64,8 +63,6 @@ UNDISTURBED_TIME, UNDISTURBED_TIME_LARGE_BUFFER = 0.04, 0.08
 """Time [s] for which frames stay with the kernel after the worker got a window: loop and worker share one interpreter,
 and each frame taken halts the worker. The second one where the kernel's buffer holds seconds of frames; its default
 holds 75 ms of a full bus."""
-MAX_CURVE_AGE = 60.0
-"""Age [s] up to which a valid window's pull over slip is used to watch for immobilisation."""
 FOREIGN_SENDER_HOLD_TIME = 3.0
 """Time [s] for which a second sender of our frames or of an input is reported, so that every reader sees it."""
 
@@ -128,7 +125,7 @@ class Service:
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
         """Failed solves by kind, since the start."""
-        self._watch, self._loss, self._warned = Watch(), NO_LOSS, False
+        self._watch = Watch()
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._stopping = False
         self._started = clock()
@@ -265,7 +262,7 @@ class Service:
                 self.failures[result.failure] += 1
             if pending.epoch == self.intake.epoch:  # else it is of a time that is none any more
                 self._take(result, pending.at)
-                present = as_of(self._vouched(result, pending.at, now), self._loss, result.t, self.config, self._warned)
+                present = as_of(self._vouched(result, pending.at, now), self._watch, result.t, self.config)
                 for message, values in hop_frames(present):
                     self._send(message, values)
             if self.on_window is not None:
@@ -305,7 +302,6 @@ class Service:
             self.intake.ingest()
         if self.intake.epoch != self._epoch:
             self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
-            self._loss, self._warned = NO_LOSS, False
             self._inputs_since = -math.inf
         if self._is_silent(now):
             self._inputs_since = -math.inf
@@ -432,7 +428,7 @@ class Service:
             return Traversability()
         result = self._last
         decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
-        return at_present(decision, basis, self._loss, self._present_time(now), self.config, self._warned)
+        return at_present(decision, basis, self._watch, self._present_time(now), self.config)
 
     def _present_time(self, now: float) -> float:
         """The bus's time, or that of the last window's end and ours since, whichever is later: the stamps' may halt."""
@@ -444,7 +440,7 @@ class Service:
     def _present_curve(self, now: float) -> OverSlip | None:
         """Pull over slip of the last window that had one, while it is young enough to extrapolate from."""
         known, t = self._curve
-        return known if self._time.at(now) - t < MAX_CURVE_AGE else None
+        return known if self._time.at(now) - t < WATCH.curve_age else None
 
     def _age(self, now: float) -> float:
         """Of the data that the decision rests on [s]."""
@@ -458,27 +454,19 @@ class Service:
 
     def _publish_ten_hertz(self, now: float) -> None:
         corrections = NO_CORRECTIONS if self._last is None else self._last.corrections
-        latest = self.intake.latest(self._time.at(now), corrections) if self.bus.is_open else Latest({}, None)
-        if latest.motion is not None:
-            self._loss = observed(self._loss, latest.motion, self.config)
-        rig = self.intake.rig
-        inertia = latest.inertia - slope_felt(self._loss, rig)
-        slips = compress(latest.slip.values(), rig.drives)
-        self._watch = watched(
-            self._watch, self._time.at(now), slips, latest.pull, self._present_curve(now), inertia
-        )  # fmt: skip
-        warning = with_loss(self._watch, self._loss, self._time.at(now))
-        self._warned = has_cause(self._watch, self._loss, self.config.warning.hold)
+        latest = self.intake.latest(self._time.at(now), corrections) if self.bus.is_open else Latest({})
+        if latest.moment is not None:
+            self._watch = watched(self._watch, latest.moment, self._present_curve(now), self.config)
+        self._watch = seen_at(self._watch, self._time.at(now), self.config)
         decision = self.present_decision(now)
-        if decision.state is State.GO and warning.warning is Alert.IMMOBILISATION:
-            self._watch = ended(self._watch)
-            warning = with_loss(self._watch, self._loss, self._time.at(now))
+        if decision.state is State.GO and self._watch.warning is Alert.IMMOBILISATION:
+            self._watch = ended(self._watch, self.config)
         known = decision.state is not State.UNKNOWN
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):
             self._send(message, values)
-        foreseeable = self.result if known and not self._loss.stuck else None
-        self._send(*forecast_frame(foreseeable, warning))
+        foreseeable = self.result if known and not self._watch.stuck else None
+        self._send(*forecast_frame(foreseeable, self._watch))
         self._send(*demand_frame(latest.draft, latest.pitch))
         self._send(
             "Traversability",

@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.config.model import Config
+from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
-from soilbus.decision.capability import Capability, Demand, assess
-from soilbus.decision.traction_loss import TractionLoss, excess_slip, missing_pull, slip_needed
+from soilbus.decision.capability import Capability, Demand, OverSlip, assess
 from soilbus.decision.traversability import State, Status, Traversability, state_of
 from soilbus.decision.uncertain_model import UncertainModel
+from soilbus.decision.watch import Watch
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
@@ -128,9 +128,7 @@ class Basis(NamedTuple):
         return float(self.instants[-1]) - self.late if len(self.instants) else -math.inf
 
 
-def at_present(
-    decision: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config, warned: bool = False
-) -> Traversability:
+def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float, config: Config) -> Traversability:
     """What remains of a window's decision at a later time.
 
     A decision is valid for the time and place of its data, and is overruled by what the wheels show:
@@ -149,44 +147,112 @@ def at_present(
         The decision when the window ended.
     basis
         Its data.
-    loss
-        Loss of traction as of now.
+    watch
+        As of now: what wheels and vehicle do, and whether immobilisation is warned of.
     now
         [s], the time of the data.
     config
         Of `max_age`, `min_share` and `contradiction`; of the wheelbase, after which rear wheels stand where front
         wheels stood; of the sensors' gain errors.
-    warned
-        Whether immobilisation is warned of.
     """
     settings, length = config.traversability, 0.0 if config.vehicle is None else config.vehicle.wheelbase
-    if loss.stuck:
+    if watch.stuck:
         return Traversability(
             State.NO_GO, 0.0, torque_available=decision.torque_available, limit="slip", since_valid=decision.since_valid
         )
-    if loss.spinning and decision.state is not State.NO_GO:
+    if watch.spinning and decision.state is not State.NO_GO:
         return replace(decision, state=State.CAUTION, probability=None)
-    if warned and decision.state is State.GO:
+    if watch.is_caused and decision.state is State.GO:
         return replace(decision, state=State.CAUTION, probability=None, contradicted="warning")
     if decision.state is State.UNKNOWN:
         return decision
     if not (now - basis.end <= settings.max_age and basis.unseen <= length):  # nor nan
         return replace(decision, state=State.UNKNOWN, probability=None)
     if decision.state is State.GO and decision.capability is not None and decision.spare is not None:
-        missing = missing_pull(loss, decision.capability.over_slip, config.noise, settings.contradiction)
+        missing = missing_pull(watch, decision.capability.over_slip, config.noise, settings.contradiction)
         left = _above(decision.spare.value - missing, decision.spare.std)
         if left < settings.go:
             return replace(decision, state=State.CAUTION, probability=left, contradicted="slip")
         forecast = decision.capability.forecast
         predicted = None if forecast is None else forecast.slip
-        if math.isfinite(loss.pull):
-            predicted = slip_needed(loss.pull, decision.capability.over_slip, config.noise)
-        if predicted is not None and excess_slip(loss, predicted, config, settings.contradiction) > 0.0:
+        if math.isfinite(watch.pull):
+            predicted = slip_needed(watch.pull, decision.capability.over_slip, config.noise)
+        if predicted is not None and excess_slip(watch, predicted, config, settings.contradiction) > 0.0:
             return replace(decision, state=State.CAUTION, probability=None, contradicted="slip")
-    measured = np.count_nonzero(basis.instants > loss.last) * basis.each
+    measured = np.count_nonzero(basis.instants > watch.last) * basis.each
     if decision.state is State.GO and measured < settings.min_share * config.estimator.window:
         return replace(decision, state=State.CAUTION, probability=None)
     return decision
+
+
+def missing_pull(watch: Watch, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
+    """Pull [N] that the estimate predicts at the present slip and the wheels significantly do not give; else 0.
+
+    Parameters
+    ----------
+    watch
+        With the present slip and pull.
+    curve
+        Predicted pull over slip.
+    noise
+        Gain errors of the speed, ground speed and draft sensors.
+    deviations
+        Standard deviations of the innovation that are subtracted.
+
+    Notes
+    -----
+    The innovation is P(s) - P.  Its variance is that of the curve, of the slip (gain errors of both speeds) and of the
+    draft's gain error.
+    """
+    known = np.isfinite(curve.pull)
+    if not known.any() or not math.isfinite(watch.slip + watch.pull) or watch.slip < curve.slip[0]:
+        return 0.0
+    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
+    predicted, std = float(np.interp(watch.slip, slips, pulls)), float(np.interp(watch.slip, slips, stds))
+    slope = float(np.interp(watch.slip, slips, np.gradient(pulls, slips))) if len(slips) > 1 else 0.0
+    of_slip = slope * (1.0 - watch.slip) * math.hypot(noise.speed.gain, noise.ground_speed.gain)
+    sd = math.hypot(std, of_slip, noise.draft.gain * watch.pull)
+    return max(predicted - watch.pull - deviations * sd, 0.0)
+
+
+def excess_slip(watch: Watch, predicted: Estimate, config: Config, deviations: float) -> float:
+    """Slip beyond the predicted one, as far as it is significant; else 0.
+
+    Parameters
+    ----------
+    watch
+        With the present slip.
+    predicted
+        Slip that the present pull needs (`slip_needed`), or where that is not known the present demand.
+    config
+        Gain errors of both speeds; slip by uneven ground.
+    deviations
+        Standard deviations of the innovation that are subtracted.
+    """
+    if not math.isfinite(watch.slip):
+        return 0.0
+    of_gains = (1.0 - watch.slip) * math.hypot(config.noise.speed.gain, config.noise.ground_speed.gain)
+    sd = math.hypot(predicted.std, of_gains, config.warning.slip_noise)
+    return max(watch.slip - predicted.value - deviations * sd, 0.0)
+
+
+def slip_needed(pull: float, curve: OverSlip, noise: NoiseOfChannels) -> Estimate | None:
+    """The least slip that gives a pull [N]; None where none does, or where slip hardly changes the pull.
+
+    Notes
+    -----
+    ds = dP / (dP/ds), with the curve's std and the draft's gain error in dP.
+    """
+    known = np.isfinite(curve.pull)
+    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
+    if len(slips) < 2 or not pull < pulls.max():
+        return None
+    i = max(int(np.argmax(pulls > pull)), 1)
+    slope = float((pulls[i] - pulls[i - 1]) / (slips[i] - slips[i - 1]))
+    if slope <= 0.0:
+        return None
+    slip = max(float(slips[i] - (pulls[i] - pull) / slope), 0.0)
+    return Estimate(slip, math.hypot(float(np.interp(slip, slips, stds)), noise.draft.gain * pull) / slope)
 
 
 def _above(margin: float, std: float) -> float:

@@ -3,9 +3,10 @@
 Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked of the vehicle; at the ceiling it does
 not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
 
-    follows      T - T' = b (Q - Q') + T' (N / N' - 1) + noise     b = T' / sum(T' / r): its share of the thrust
-    saturated    T - T' =                                noise     chi-square within noise, less than of `follows`
+    follows      T - b (Q - Q') - T' (N / N' - 1) has no trend     b = T' / sum(T' / r): its share of the thrust
+    saturated    T - T' is noise, and T does not follow            a trend: a slope beyond what its residuals explain
 
+What shakes the vehicle has no trend, however little its sensors say of their noise.
 A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
 it down is not asked of the motors: a vehicle that loses speed under a draft that rises while its torques stand has an
 unmet demand.  A ceiling is never exceeded, so only the highest torque measured so far can be one.
@@ -24,7 +25,6 @@ import numpy as np
 
 from soilbus.arrays import Array, Mask
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_asked
-from soilbus.terra.vehicle import GRAVITY
 
 LEAST_BINS = 4
 """Bins of a span from which scatter and trend can be separated: one mean, one slope, two degrees of freedom."""
@@ -114,27 +114,29 @@ class TorqueCeiling:
 
 
 def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
-    """Which wheels' torques (W,) stand within noise while the pull asked of the vehicle changes."""
+    """Which wheels' torques (W,) stand within noise and do not follow the trend of the pull asked of the vehicle."""
     assert rig.chassis is not None
-    mass, n = rig.chassis.mass, len(window.t)
     pull = pull_asked(window, rig.chassis) + np.maximum(inertia_of(window, rig.chassis), 0.0)
-    of_pull = window.variance["draft"] + (mass * GRAVITY) ** 2 * _known(window, "pitch")
-    of_pull = of_pull + mass**2 * _known(window, "acceleration")
-    mean, variance = window.torque.mean(axis=0), window.variance["torque"]
+    mean, n = window.torque.mean(axis=0), len(window.t)
+    since = (window.t - window.t.mean())[:, None]
     with np.errstate(all="ignore"):  # nan and inf where a sensor sends what no motor gives
         share = mean / np.nansum(mean / rig.radius)
-        load = window.load.mean(axis=0)
-        of_load = (mean / load) ** 2 * window.variance["load"]
-        weighed = np.isfinite(load) & np.isfinite(of_load).all(axis=0)
-        rest = window.torque - mean - (pull - pull.mean())[:, None] * share
-        of_rest = variance + share**2 * of_pull[:, None]
-        unweighed = (rest**2 / of_rest).sum(axis=0)
-        rest = rest - np.where(weighed, mean * (window.load / load - 1.0), 0.0)
-        of_rest = of_rest + np.where(weighed, of_load, 0.0)
-        stands = ((window.torque - mean) ** 2 / variance).sum(axis=0)
-        follows = np.minimum(unweighed, (rest**2 / of_rest).sum(axis=0))
-        flat = stands <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
-        return np.asarray((share > 0.0) & flat & (follows - stands > deviations**2))
+        by_pull = (pull - pull.mean())[:, None] * share
+        by_load = np.nan_to_num(mean * (window.load / window.load.mean(axis=0) - 1.0))
+        spread = ((window.torque - mean) ** 2 / window.variance["torque"]).sum(axis=0)
+        stands = spread <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
+        follows = [_trend(since, window.torque - by_pull - part) <= deviations for part in (0.0, by_load)]
+    return np.asarray((share > 0.0) & stands & ~follows[0] & ~follows[1])
+
+
+def _trend(since: Array, values: Array) -> Array:
+    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959)."""
+    values, free = values - values.mean(axis=0), len(values) - 2
+    spread = float((since**2).sum())
+    slope = (since * values).sum(axis=0) / spread
+    rest = ((values - slope * since) ** 2).sum(axis=0) / free
+    share = (8.0 * free + 1.0) / (8.0 * free + 3.0)
+    return np.asarray(share * np.sqrt(free * np.log1p(slope**2 * spread / rest / free)))
 
 
 def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
@@ -143,8 +145,3 @@ def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
     noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
     with np.errstate(invalid="ignore"):  # a ground speed that is no number
         return float(since @ window.ground_speed), noise
-
-
-def _known(window: Window, quantity: str) -> Array:
-    """Variance (N,) of a quantity, 0 where it is not measured."""
-    return np.where(np.isfinite(getattr(window, quantity)), window.variance[quantity], 0.0)

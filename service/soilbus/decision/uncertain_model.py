@@ -64,7 +64,7 @@ class UncertainModel:
     @classmethod
     def of(
         cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], gaussian: Gaussian, n_wheels: int,
-        ground_speed: float, widening: float = 1.0, form: FormPosterior | None = None,
+        ground_speed: float, form: FormPosterior | None = None,
     ) -> UncertainModel:  # fmt: skip
         """The model with the effects' parameters as a window's posterior has them.
 
@@ -80,8 +80,6 @@ class UncertainModel:
             Number of wheels.
         ground_speed
             [m/s], at which effects are evaluated; only those that act in steady driving have a perturbed model.
-        widening
-            Factor of the covariance, as of `Posterior.widened`.
         form
             Posterior of the model's form; None where it is not uncertain.
         """
@@ -109,8 +107,7 @@ class UncertainModel:
             step[places] = axis * np.sqrt(size)
             shift = gaussian.covariance[:_SOIL, of_effects] @ axis / np.sqrt(size)
             sign = _sign_inside(free, standardised, step)
-            scale = sign * np.sqrt(widening / (1.0 + (widening - 1.0) * min(size, 1.0)))
-            perturbed.append(PerturbedModel(at(standardised + scale * step), scale * shift))
+            perturbed.append(PerturbedModel(at(standardised + sign * step), sign * shift))
         return cls(mean, tuple(perturbed + of_form), len(of_form))
 
     @property

@@ -98,16 +98,11 @@ class VehicleDiagnosis:
     @property
     def probabilities(self) -> dict[str, float]:
         """Probability of each effect that may be in the model."""
-        return by_name(self.places)
-
-
-def by_name(places: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The greatest probability of each name."""
-    found: dict[str, float] = {}
-    for place in places:
-        for name, p in place.items():
-            found[name] = max(p, found.get(name, 0.0))
-    return found
+        found: dict[str, float] = {}
+        for place in self.places:
+            for name, p in place.items():
+                found[name] = max(p, found.get(name, 0.0))
+        return found
 
 
 def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Sequence[Effect]) -> VehicleDiagnosis:

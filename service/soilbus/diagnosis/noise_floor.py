@@ -37,7 +37,9 @@ def noise_factors(records: Sequence[Record], fitted: FittedModel) -> dict[str, f
         training = record.training.with_effects(fitted.effects, fitted.free)
         parts = (training, fit.optimum.at, fit.optimum.gains), (check.problem, check.at, fit.mode.gains)
         for problem, at, gains in parts:
-            for kind, value, expected in corrections(problem, at, gains):
+            values, of_squares, columns = corrections(problem, at, gains)
+            for kind, own in columns.items():
+                value, expected = values[:, own], of_squares[:, own]
                 first, next_ = _neighbours(problem, KINDS[kind])
                 known = np.minimum(expected[first], expected[next_]) > 0.0
                 change = (value[next_] - value[first])[known]

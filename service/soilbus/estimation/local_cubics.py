@@ -10,6 +10,7 @@ smoothed value.  A channel that varies slowly is averaged over many samples, one
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -91,16 +92,19 @@ def curve_of(t: Array, value: Array, variance: Array) -> Curve:
     t, value, variance : Array
         Ascending times [s], samples and their noise variances, (K,).
     """
-    best, least = _curve(t, value, 0), 2.0  # of no smoothing w0 = 1
-    for half in HALF_WIDTHS if len(t) else ():
-        curve = _curve(t, value, half)
-        if not curve.half_width:
+    best, least = 0, 2.0  # of no smoothing w0 = 1
+    _, runs = _runs(t)
+    weight = 1.0 / np.where(variance > 0.0, variance, np.inf)
+    for half in HALF_WIDTHS:
+        off, long = np.zeros(len(t)), _long_enough(runs, half, len(t))
+        if not long:
             break
-        weighed = (value - curve.value) ** 2 / np.where(variance > 0.0, variance, np.inf)
-        risk = float(weighed.mean()) + 2.0 * _cubics(half).own
+        for run in long:
+            off[run] = value[run] - _smoothed(value[run], half, 1)[0]
+        risk = float((off**2 * weight).mean()) + 2.0 * _cubics(half).own
         if risk < least:
-            best, least = curve, risk
-    return best
+            best, least = half, risk
+    return _curve(t, value, best)
 
 
 def faithful(curve: Curve, value: Array) -> Curve:
@@ -112,23 +116,34 @@ def faithful(curve: Curve, value: Array) -> Curve:
     return _curve(curve.t, value, max(curve.half_width // 2, HALF_WIDTHS[0])) if curve.half_width else curve
 
 
-def _curve(t: Array, value: Array, half: int) -> Curve:
-    """The curve by cubics through `half` samples on each side; the samples themselves where runs are too short."""
+def _runs(t: Array) -> tuple[float, list[slice]]:
+    """Median step of times t (K,) [s], and the runs of samples of which none is missing."""
     steps = np.diff(t)
     step = float(np.median(steps)) if len(steps) else 0.0
-    slope = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
-    unsmoothed = Curve(t, value, slope, np.zeros(len(t)), _gradient_gain(t), step, 0)
-    runs = np.split(np.arange(len(t)), np.flatnonzero(steps > 1.5 * step) + 1)  # where a sample is missing
-    runs = [run for run in runs if len(run) > 2 * half]
-    if not half or 2 * sum(map(len, runs)) < len(t):
-        return unsmoothed
-    smooth, slope, second, slope_gain = (a.copy() for a in (value, slope, unsmoothed.second, unsmoothed.slope_gain))
+    ends = [0, *(np.flatnonzero(steps > 1.5 * step) + 1).tolist(), len(t)]
+    return step, [slice(*run) for run in pairwise(ends)]
+
+
+def _long_enough(runs: list[slice], half: int, n: int) -> list[slice]:
+    """The runs that hold a cubic through `half` samples on each side; none where less than half of n samples do."""
+    found = [run for run in runs if run.stop - run.start > 2 * half]
+    return found if half and 2 * sum(run.stop - run.start for run in found) >= max(n, 1) else []
+
+
+def _curve(t: Array, value: Array, half: int) -> Curve:
+    """The curve by cubics through `half` samples on each side; the samples themselves where runs are too short."""
+    step, runs = _runs(t)
+    slope = np.gradient(value, t) if len(t) > 1 and bool((np.diff(t) > 0.0).all()) else np.zeros(len(t))
+    smooth, second, slope_gain = value.copy(), np.zeros(len(t)), _gradient_gain(t)
+    runs = _long_enough(runs, half, len(t))
+    if not runs:
+        return Curve(t, value, slope, second, slope_gain, step, 0)
     gain = (_cubics(half).weights[1] ** 2).sum(axis=1) / step**2
     for run in runs:
         smooth[run], by_step, twice = _smoothed(value[run], half)
         slope[run], second[run] = by_step / step, twice / step**2
         slope_gain[run] = gain[half]
-        slope_gain[run[:half]], slope_gain[run[len(run) - half :]] = gain[:half], gain[half + 1 :]
+        slope_gain[run][:half], slope_gain[run][-half:] = gain[:half], gain[half + 1 :]
     return Curve(t, smooth, slope, second, slope_gain, step, half)
 
 
@@ -198,10 +213,10 @@ def _cubics(half: int) -> _Cubics:
     return _Cubics(np.stack([basis, by_step, twice]) @ fit, float((basis @ fit)[half, half]))
 
 
-def _smoothed(values: Array, half: int) -> Array:
-    """Smoothed values and their first two derivatives by the step number (3, K), K > 2 half."""
-    out = np.empty((3, len(values)))
-    for smooth, weights_at in zip(out, _cubics(half).weights, strict=True):
+def _smoothed(values: Array, half: int, n: int = 3) -> Array:
+    """Smoothed values and their first two derivatives by the step number, n of them (n, K), K > 2 half."""
+    out = np.empty((n, len(values)))
+    for smooth, weights_at in zip(out, _cubics(half).weights, strict=False):
         smooth[half : len(values) - half] = np.convolve(values, weights_at[half][::-1], "valid")
         smooth[:half] = weights_at[:half] @ values[: 2 * half + 1]
         smooth[len(values) - half :] = weights_at[half + 1 :] @ values[-2 * half - 1 :]

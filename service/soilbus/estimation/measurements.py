@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
 from soilbus.estimation.local_cubics import Series, curve_of
-from soilbus.estimation.standing import STANDING, StandingColumns, slope, standing_columns, standing_std
+from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -50,8 +50,8 @@ MASS_GAIN = "load.weight"
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
-    "inertia", "inertia_var", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
-    "acceleration_var",
+    "inertia", "inertia_var", "draft_noise", "has_balance", "pitch", "since", "distance", "wheel_angle",
+    "acceleration", "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
     "_side_known", "standing_rows", "standing_latents",
 )  # fmt: skip
@@ -216,7 +216,7 @@ class Measurements:
         kept = np.searchsorted(window.t, self.t)
         stamped._stand(standing_columns(replace(window, **shaped), self.rig), kept)
         own = np.zeros((*stamped.standing_rows.shape[:2], W))
-        slopes = slope(window.t, smooth["torque"])[kept]
+        slopes = np.nan_to_num(np.gradient(smooth["torque"], window.t, axis=0))[kept]
         own[:, :W] = (
             np.eye(W) * slopes[:, None] if self._torque_matrix is None else self._torque_matrix * slopes[:, None]
         )
@@ -330,6 +330,8 @@ class Measurements:
         self.inertia, self.demand_var = inertia, draft_var + inertia_var
         self.has_balance = known & usable.all(axis=1)
         self.draft_var, self.inertia_var = np.where(self.has_balance, [draft_var, inertia_var], 0.0)
+        stepped = float((np.diff(self.draft[self.has_balance]) ** 2).sum())  # holds the noise of readings twice
+        self.draft_noise = self.draft_var * min(1.0, stepped / max(2.0 * float(self.draft_var.sum()), 1e-9))
 
     @property
     def demand(self) -> Array:

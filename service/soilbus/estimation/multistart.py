@@ -153,11 +153,6 @@ def fit_warm(start: WarmStart) -> Fit | None:
         )
 
 
-def refine(objective: Objective, start: Iterate) -> Fit | None:
-    """Fit from near the optimum; None where the numbers are not finite."""
-    return fit_at(objective, minimise(objective, start, objective.options.warm, 0.0))
-
-
 def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
     """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, the second likeliest.
 

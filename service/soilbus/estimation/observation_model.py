@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_derivatives
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
 from soilbus.terra.effects.along import through_low_pass
 from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
@@ -67,8 +67,6 @@ SOIL = slice(1, 1 + len(Soil._fields))
 """Columns with the derivatives by the soil parameters."""
 FIRST_GAIN = SOIL.stop
 """Column of the first nuisance parameter: the sensor gains, then the effect parameters."""
-TIME_TOLERANCE = 1e-3
-"""Times [s] closer than this are those of one bin."""
 _TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
 """Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
 _DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
@@ -156,6 +154,7 @@ class Linearisation:
     weighed: Array
     normal: Array
     by_latents: Array  # (N, m, 2 W + 1) by the observations of the latents
+    inverse: Array  # (N, m, m) inverse covariance of the rows of each instant
     corrected: Array  # (N, 2 W + 1) observations of the latents over 1 + gain
     variance: Array  # (N, 2 W + 1) variance of `corrected`
     by_gain: Array  # (N, 2 W + 1) minus the derivative of `corrected` by its own gain
@@ -361,7 +360,7 @@ class ObservationModel(Measurements):
         if by_sensors:
             # draft and inertia without their noise, which S^-1 r says: a gain times noise would fit better when smaller
             noise = (inverse[:, balance] * residual).sum(1)
-            true_draft = self.has_balance * (draft - self.draft_var * of_draft**2 * noise)
+            true_draft = self.has_balance * (draft - self.draft_noise * of_draft**2 * noise)
             by_gain[:, balance, layout.draft_gain] = -of_draft * true_draft
             if self._mass_gain is not None:
                 true_inertia = self.has_balance * (inertia - self.inertia_var * of_mass**2 * noise)
@@ -373,6 +372,7 @@ class ObservationModel(Measurements):
             weighed=weighed,
             normal=flat.T @ weighed,
             by_latents=A,
+            inverse=inverse,
             corrected=corrected,
             variance=variance,
             by_gain=latent_by_gain,
@@ -686,9 +686,8 @@ class ObservationModel(Measurements):
         """Derivatives (R, 4) of the residuals by `model_form.FORM` at an optimum, and these weighed by S^-1."""
         soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
         layout, (n, m) = self.layout, at.by_latents.shape[:2]
-        instants = np.unique(
-            np.linspace(0, n - 1, math.ceil(n / self.options.posterior.form_stride)).round().astype(int)
-        )
+        some = max(math.ceil(n / self.options.posterior.form_stride), 2)
+        instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
         sparse = self.part(instants)._contact_by_form(soil, gains, latents.part(instants))
         by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
@@ -700,8 +699,7 @@ class ObservationModel(Measurements):
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
         self._without_sides(rows, at.by_sides)
         rows[~self._known] = 0.0
-        variance, row_var = self._corrected(gains)[5:]
-        weighed = self.inverse_covariance(at.by_latents, variance, row_var) @ rows
+        weighed = at.inverse @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
     def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:

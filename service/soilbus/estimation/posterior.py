@@ -155,32 +155,6 @@ class Posterior:
         """Strength c + p tan phi [Pa] below a pressure p [Pa]."""
         return self._estimate(shear_strength(self.soil, pressure))
 
-    def widened(self, factor: float, prior: SoilPrior) -> Posterior:
-        """The posterior if the data's noise variance is `factor` times what was assumed.
-
-        Parameters
-        ----------
-        factor
-            1 or more; else nothing changes.
-        prior
-            The prior that the posterior holds.
-
-        Notes
-        -----
-        The information of the data is divided by the factor, that of the prior is not: in units of the prior's
-        sd each principal variance s becomes 1 / (1 + (1 / s - 1) / factor).  So no variance exceeds the prior's.
-        """
-        free = prior.free
-        if factor <= 1.0 or not len(free):
-            return self
-        unit = prior.log_std[free]
-        variance, axes = np.linalg.eigh(self.log_covariance[np.ix_(free, free)] / np.outer(unit, unit))
-        variance = np.clip(variance, 0.0, 1.0)
-        wide = factor * variance / (1.0 + (factor - 1.0) * variance)
-        covariance = np.zeros_like(self.log_covariance)
-        covariance[np.ix_(free, free)] = (axes * wide) @ axes.T * np.outer(unit, unit)
-        return Posterior(self.soil, covariance)
-
     def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
         """The posterior with a covariance of the logarithms added, as by considered parameters.
 

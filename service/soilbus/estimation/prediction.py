@@ -44,8 +44,8 @@ def prediction_shares(problem: ObservationModel, at: Linearisation, since: float
     known = known[:, : W + 1]
     thrust = np.abs(problem.wheel_torque[new] / problem.rig.radius).sum(axis=1)
     size = np.column_stack([np.where(known[:, :W], problem.torque[new], 0.0), np.where(known[:, W], thrust, 0.0)])
-    sums = (block_sums(values, t, block) for values in (residual, residual**2, size, known.astype(float)))
-    errors, squares, sizes, counts = sums
+    sums = block_sums(np.hstack([residual, residual**2, size, known]), t, block)
+    errors, squares, sizes, counts = np.split(sums, 4, axis=1)
     counts = np.maximum(counts, 1.0)
     noise = np.maximum(squares - errors**2 / counts, 0.0) / np.maximum(counts - 1.0, 1.0)  # of an instant
     found = (errors / counts) ** 2 - noise / counts, (sizes / counts) ** 2

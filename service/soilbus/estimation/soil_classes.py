@@ -97,7 +97,7 @@ class SoilClasses:
         measured = _evidence(posterior, guess, self.width, self.spread[-1])
         centre, spread = self.centre[:, measured.parameters], self.spread[:, measured.parameters]
         off = measured.value - centre @ measured.direction.T
-        covariance = np.einsum("mp,cp,np->cmn", measured.direction, spread**2, measured.direction)
+        covariance = (measured.direction * spread[:, None] ** 2) @ measured.direction.T
         covariance += np.diag(measured.variance)
         distance = np.einsum("cm,cm->c", off, np.linalg.solve(covariance, off[:, :, None])[:, :, 0])
         log = -0.5 * (distance + np.linalg.slogdet(covariance)[1]) + np.log(self._prior)

@@ -363,15 +363,6 @@ class Objective:
         of_base, prior = Gaussian(base, gains, logs), self.coordinates.prior
         return of_base.relinearised(soil, gains, prior, self.coordinates.width)
 
-    def shifted(self, gaussian: Gaussian, step: Array, covariance: Array) -> Gaussian:
-        """A Gaussian shifted by a step (F + A,), with this covariance (F + A, F + A) of the step added."""
-        free, gains = len(self.free), gaussian.gains.copy()
-        gains[self.active] += step[free:]
-        soil = self.coordinates.stepped(gaussian.soil, step[:free])
-        added = self.gaussian(gaussian.soil, gains, covariance).covariance
-        wider = replace(gaussian, covariance=gaussian.covariance + added)
-        return wider.relinearised(soil, gains, self.coordinates.prior, self.coordinates.width)
-
 
 class Termination(StrEnum):
     """Why a descent ended."""
@@ -482,9 +473,12 @@ def minimise(
                 evaluations += 1
             continue
         last_decrease = here.decrease if fraction == 1.0 else 0.0
-        if there.value > here.value:
+        if there.value > here.value:  # it overshot
             max_rise *= options.shortening
-        here, n_rejected, fraction = there, 0, min(2.0 * fraction, 1.0)
+            fraction *= options.shortening
+        else:
+            fraction = min(2.0 * fraction, 1.0)
+        here, n_rejected = there, 0
         if here.value < lowest.value:
             lowest = here
     if ended is not Termination.STEP:

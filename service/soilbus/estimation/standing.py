@@ -60,25 +60,22 @@ def standing_columns(window: Window, rig: Rig) -> StandingColumns:
     columns = StandingColumns(np.zeros((N, W, S)), np.zeros((N, S)), np.zeros((N, 2 * W + 1, S)))
     if N < 3 or rig.chassis is None:
         return columns
-    t, ground = window.t, window.ground_speed[:, None]
+    ground = window.ground_speed[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = 1.0 - ground / (rig.radius * window.speed)
-        relaxed = -slope(t, slip) / ground * (rig.radius * window.speed**2 / ground)
+        slopes = np.gradient(np.column_stack([
+            slip, window.speed, window.load, ground, window.draft, window.acceleration,
+        ]), window.t, axis=0)  # fmt: skip
+        slopes = np.where(np.isfinite(slopes), slopes, 0.0)  # of which a neighbour is unknown
+        relaxed = -slopes[:, :W] / ground * (rig.radius * window.speed**2 / ground)
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
-    columns.torque[:, :, 1] = -wheel_inertia(rig) * slope(t, window.speed)
-    columns.latents[:, :W, 2] = slope(t, window.load) if _measures_loads(rig) else 0.0
-    columns.latents[:, 2 * W, 3] = slope(t, ground)[:, 0]
-    columns.demand[:, 4] = slope(t, window.draft[:, None])[:, 0]
-    columns.demand[:, 5] = rig.chassis.mass * slope(t, window.acceleration[:, None])[:, 0]
+    columns.torque[:, :, 1] = -wheel_inertia(rig) * slopes[:, W : 2 * W]
+    columns.latents[:, :W, 2] = slopes[:, 2 * W : 3 * W] if _measures_loads(rig) else 0.0
+    columns.latents[:, 2 * W, 3], columns.demand[:, 4] = slopes[:, 3 * W], slopes[:, 3 * W + 1]
+    columns.demand[:, 5] = rig.chassis.mass * slopes[:, 3 * W + 2]
     return columns
 
 
 def _measures_loads(rig: Rig) -> bool:
     given = rig.instrumentation
     return given is None or all(row.kind == "channel" for row in given.load)
-
-
-def slope(t: Array, values: Array) -> Array:
-    """Return slopes (N, C) of values (N, C) over times t (N,) [s]; 0 where a neighbour is unknown."""
-    found = np.gradient(values, t, axis=0)
-    return np.where(np.isfinite(found), found, 0.0)

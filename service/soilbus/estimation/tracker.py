@@ -28,14 +28,12 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.instants import averaged
+from soilbus.estimation.last_run import passes_prior_conflict_test, prior_from_last_run
 from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import (
-    TIME_TOLERANCE,
-    ObservationModel,
-    ObservationModelWithEffects,
-)
+from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -44,7 +42,7 @@ from soilbus.estimation.search_budget import SearchBudget
 from soilbus.estimation.soil_state import ChangePoint, Reason, Shown, SoilState, TrackerState, next_state
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.variance_components import VarianceComponents, correction_ratios
-from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window, window_of_samples
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
@@ -82,17 +80,20 @@ class Settings:
         Evaluations of the model that searches may take, see `SearchBudget`.
     hop : float
         Time [s] from one window to the next.
+    instant : float
+        Length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins.
     """
 
     window: float
     min_speed: float
     max_turn: float
     drift: float
-    min_rows: int = 60
+    min_rows: int = 15
     form: tuple[float, ...] = ()
     search_rate: float = 4.0
     search_burst: float = 100.0
     hop: float = 1.0
+    instant: float = ESTIMATOR.tracker.instant
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +199,12 @@ class Tracker:
         return self.prior if self._state.transition is None else self._new_soil_prior
 
     @property
+    def instant(self) -> float:
+        """Length [s] of an instant; 0, bins as they are, on tracks alone: no tyre relaxes or bounces."""
+        lengths = self.rig.lengths
+        return 0.0 if lengths is not None and (lengths > 0.0).all() else self.settings.instant
+
+    @property
     def state(self) -> SoilState:
         """Which soil the last window was of."""
         return self._state
@@ -254,7 +261,9 @@ class Tracker:
         """
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
-        return replace(self._estimate(window, end), search_ended=self._budget.ended)
+        if not recent:  # what windows before left is no measure of ground that none of them was on
+            self._components = VarianceComponents(self.rig.options.variance)
+        return replace(self._estimate(averaged(window, end, self.instant), end), search_ended=self._budget.ended)
 
     def _estimate(self, window: Window, end: float) -> TrackerOutput:
         """One step of the recursion: data of the present soil, explanation, next state, report."""
@@ -553,57 +562,6 @@ def new_soil_prior(prior: SoilPrior) -> SoilPrior:
     """Prior of a new soil: log sd at least the spread of the soils in `terra.soils`; held parameters stay held."""
     soils = np.log(list(SOILS.values()))
     return SoilPrior(prior.median, np.where(prior.log_std > 0.0, np.maximum(prior.log_std, soils.std(0)), 0.0))
-
-
-def prior_from_last_run(
-    gaussian: Gaussian,
-    soil: SoilPrior,
-    gain_std: Array,
-    elapsed: float,
-    correlation_time: float = ESTIMATOR.tracker.gain_correlation_time,
-) -> Gaussian:
-    """Joint prior of a run from the posterior of the last one: the soil's prior, and gains drawn back to theirs.
-
-    Parameters
-    ----------
-    gaussian : Gaussian
-        Posterior at the end of the last run.
-    soil : SoilPrior
-        Prior of the soil; the vehicle may stand on another one now.
-    gain_std : Array
-        Prior sd of the gains (G,).
-    elapsed : float
-        Time since then [s].
-    correlation_time : float
-        [s], `TrackerOptions.gain_correlation_time`.
-
-    Returns
-    -------
-    Gaussian
-        Gains k g with variance k^2 var + (1 - k^2) gain_std^2, k = exp(-elapsed / correlation_time).
-
-    References
-    ----------
-    Gain errors as a stationary process: Uhlenbeck & Ornstein 1930, Phys. Rev. 36, 823.
-    """
-    kept = math.exp(-elapsed / correlation_time) * (gain_std > 0.0)
-    covariance = np.zeros_like(gaussian.covariance)
-    covariance[:_SOIL, :_SOIL] = np.diag(soil.log_std**2)
-    of_gains = kept[:, None] * gaussian.covariance[_SOIL:, _SOIL:] * kept
-    covariance[_SOIL:, _SOIL:] = of_gains + np.diag((1.0 - kept**2) * gain_std**2)
-    return Gaussian(soil.median, kept * gaussian.gains, covariance)
-
-
-def passes_prior_conflict_test(problem: ObservationModel, soil: SoilPrior, joint_prior: Gaussian) -> bool:
-    """Whether a window's evidence with the gains of the last run is at least that with their prior alone.
-
-    A sensor exchanged or calibrated since then has another gain error and fails the test.
-    """
-    other = fit_window(problem, soil, Gaussian.of(soil, problem.gain_std))
-    fit = fit_window(problem, soil, joint_prior)
-    if fit is None or not fit.converged:
-        return False
-    return other is None or not other.converged or fit.neg2_log_evidence <= other.neg2_log_evidence
 
 
 def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list[str], Array]:

@@ -14,8 +14,9 @@ instants: noise that averages out within a second is still in each instant's loa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -90,41 +91,41 @@ def correction_ratios(problem: ObservationModel, optimum: Optimum, options: Vari
     options : VarianceOptions
         Length of a block.
     """
-    found = {}
-    for kind, value, expected in corrections(problem, optimum.at, optimum.gains):
-        total = float(expected.sum())
-        if total > options.least_share * problem.n:
-            found[kind] = max(float((s**2).sum()) for s in (value, block_sums(value, problem.t, options.block))) / total
-    return found
+    values, expected, of_kind = corrections(problem, optimum.at, optimum.gains)
+    squares = np.stack([(v**2).sum(axis=0) for v in (values, block_sums(values, problem.t, options.block))])
+    shown = expected.sum(axis=0)
+    totals = {kind: float(shown[columns].sum()) for kind, columns in of_kind.items()}
+    return {
+        kind: float(squares[:, of_kind[kind]].sum(axis=1).max()) / total
+        for kind, total in totals.items()
+        if total > options.least_share * problem.n
+    }
 
 
-def corrections(problem: ObservationModel, at: Linearisation, gains: Array) -> Iterator[tuple[str, Array, Array]]:
-    """Yield each kind of sensor with its corrections (N, C) at a fit, in its own sd, and their expected squares."""
+def corrections(problem: ObservationModel, at: Linearisation, gains: Array) -> tuple[Array, Array, dict[str, Any]]:
+    """Return sensors' corrections (N, C) in their sd, their expected squares, and the columns of each kind."""
     A, (N, m) = at.by_latents, at.by_latents.shape[:2]
     e = at.weighed[:, RESIDUAL].reshape(N, m)
     variance, row_var = problem.variances(gains)
-    inverse = problem.inverse_covariance(A, variance, row_var)
-    by_latents = np.einsum("nml,nm->nl", A, e)
-    shares = variance * np.einsum("nml,nmk,nkl->nl", A, inverse, A, optimize=True)
-    of_rows = row_var * np.einsum("nmm->nm", inverse)
+    by_latents = (e[:, None] @ A)[:, 0]
+    shares = variance * (A * (at.inverse @ A)).sum(axis=1)
+    of_rows = row_var * np.einsum("nmm->nm", at.inverse)
     layout, known = problem.layout, problem.known
     known = known & problem.measured_rows
-    rows = np.where(known, np.sqrt(row_var) * e, 0.0), np.where(known, of_rows, 0.0)
-    correction, measured = np.sqrt(variance) * by_latents, problem.measured_latents
+    measured, loads = problem.measured_latents, layout.loads
     if problem.rig.lengths is not None:  # a track's load is the mean of a window, and single instants do not show it
-        shares[:, layout.loads] = np.where(problem.rig.lengths > 0.0, 0.0, shares[:, layout.loads])
-    latents = correction, np.where(measured, shares, 0.0)
-    computed = correction, np.where(measured, 0.0, shares)
-    for kind, (values, expected), columns in (
-        ("torque", rows, layout.torques),
-        ("draft", rows, slice(layout.balance, layout.balance + 1)),
-        ("sinkage", rows, layout.sinkages),
-        ("load", latents, layout.loads),
-        ("computed_load", computed, layout.loads),
-        ("speed", latents, layout.speeds),
-        ("ground_speed", latents, slice(layout.ground_speed, layout.ground_speed + 1)),
-    ):
-        yield kind, np.where(expected[:, columns] > 0.0, values[:, columns], 0.0), expected[:, columns]
+        shares[:, loads] = np.where(problem.rig.lengths > 0.0, 0.0, shares[:, loads])
+    expected = np.hstack([np.where(known, of_rows, 0.0), np.where(measured, shares, 0.0)])
+    expected = np.hstack([expected, np.where(measured[loads], 0.0, shares[:, loads])])
+    of_latents = np.sqrt(variance) * by_latents
+    values = np.hstack([np.sqrt(row_var) * e, of_latents, of_latents[:, loads]])
+    latents, computed = np.arange(m, m + layout.n_latents), slice(m + layout.n_latents, None)
+    of_kind: dict[str, Any] = {
+        "torque": layout.torques, "draft": [layout.balance], "sinkage": slice(layout.sinkages.start, m),
+        "load": latents[loads], "computed_load": computed, "speed": latents[layout.speeds],
+        "ground_speed": latents[[layout.ground_speed]],
+    }  # fmt: skip
+    return np.where(expected > 0.0, values, 0.0), expected, of_kind
 
 
 def block_sums(values: Array, t: Array, block: float) -> Array:

@@ -41,6 +41,8 @@ __all__ = [
 
 WHEEL_QUANTITIES = ("torque", "load", "speed", "sinkage")
 """Quantities that each wheel has a channel of."""
+TIME_TOLERANCE = 1e-3
+"""Times [s] closer than this are those of one bin."""
 VEHICLE_QUANTITIES = (
     "ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "roll", "steering_angle", "differential_lock",
 )  # fmt: skip

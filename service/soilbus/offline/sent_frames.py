@@ -9,7 +9,7 @@ recording are left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import can
@@ -25,6 +25,7 @@ from soilbus.offline.played_bus import InlineExecutor, PlayedBus, PlayedClock
 from soilbus.offline.replay import LogError, log_of
 from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 
 __all__ = ["sent_beside", "sent_frames"]
 
@@ -52,8 +53,13 @@ def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
         yield from sent_beside(config, _readable(config, log))
 
 
-def sent_beside(config: Config, frames: Iterator[Frame]) -> Iterator[can.Message]:
-    """What the service sends while these frames are on its bus, as `sent_frames`; they may depend on what it sent."""
+def sent_beside(
+    config: Config, frames: Iterator[Frame], on_window: Callable[[WindowResult], None] | None = None
+) -> Iterator[can.Message]:
+    """What the service sends while these frames are on its bus, as `sent_frames`; they may depend on what it sent.
+
+    `on_window` is called with each window's result.
+    """
     database, ours = load_databases(config), output_database(config)
     check_cycle_times(config, ours)
     clock, pipeline = PlayedClock(), Pipeline(config, database)
@@ -61,7 +67,7 @@ def sent_beside(config: Config, frames: Iterator[Frame]) -> Iterator[can.Message
     bus = LiveBus(lambda: played, clock, clock.sleep)
     bus.open()
     service = Service(
-        config, pipeline, bus, Publisher(ours), Notifier(), InlineExecutor(), clock, waiting=clock.wait_for
+        config, pipeline, bus, Publisher(ours), Notifier(), InlineExecutor(), clock, on_window, waiting=clock.wait_for
     )
     while not played.is_empty:
         service.step()

@@ -84,12 +84,11 @@ def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
     posterior = fit.posterior
     low, high = loaded_depths(fit, rig)
     bearing = posterior.bearing_pressure(min(max(settings.z_ref, low), high), settings.b_ref)
-    sheared = posterior.tan_phi(), posterior.shear_strength(contact_pressure(fit, rig))
-    lacks = {
-        "load_range": _is_wide(bearing, settings.max_bearing_std),
-        "slip_range": rig.chassis is None and all(_is_wide(e, settings.max_tan_phi_std) for e in sheared),
-    }
-    return [name for name, is_lacking in lacks.items() if is_lacking]
+    lacks = ["load_range"] if _is_wide(bearing, settings.max_bearing_std) else []
+    if rig.chassis is None:
+        sheared = posterior.tan_phi(), posterior.shear_strength(contact_pressure(fit, rig))
+        lacks += ["slip_range"] * all(_is_wide(e, settings.max_tan_phi_std) for e in sheared)
+    return lacks
 
 
 def draft_is_known(draft: Estimate | None, rig: Rig, settings: Estimator) -> bool:
@@ -115,7 +114,8 @@ def sinkage_range(fit: Fit, rig: Rig) -> tuple[float, float] | None:
     known = depth[np.isfinite(depth) & (fit.optimum.latents.entry_angle < MAX_ENTRY_ANGLE)]
     if not len(known):
         return None
-    low, high = np.percentile(known, (5.0, 95.0)).tolist()
+    place = np.arange(len(known)) / max(len(known) - 1, 1)
+    low, high = np.interp((0.05, 0.95), place, np.sort(known)).tolist()
     return low, high
 
 

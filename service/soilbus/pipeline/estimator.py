@@ -3,8 +3,8 @@
     WindowTask -> Tracker (posterior of the soil) -> status -> judge (capability, probability) -> hysteresis -> watch
 
 `estimate` needs the estimation only and may run in another process; it returns an `Undecided`: the window's result so
-far and what the decision needs.  `decide` takes these in order and holds the state from window to window: hysteresis,
-loss of traction, immobilisation watch.
+far and what the decision needs.  `decide` takes these in order and holds the state from window to window: hysteresis
+and watch.
 """
 
 from __future__ import annotations
@@ -21,30 +21,14 @@ from soilbus.allocator import keep_freed_memory
 from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
-from soilbus.decision.immobilisation import (
-    Alert,
-    Warnings,
-    Watch,
-    ended,
-    has_cause,
-    moments,
-    watched,
-    with_loss,
-)
+from soilbus.decision.driveline import disengaged, idle, shared_out
 from soilbus.decision.judgement import Basis, judge
+from soilbus.decision.moments import bins_of_a_moment, moments
+from soilbus.decision.options import WATCH
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import (
-    NO_LOSS,
-    bins_of_a_moment,
-    disengaged,
-    idle,
-    motions,
-    observed,
-    shared_out,
-    slope_felt,
-)
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
+from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
 from soilbus.estimation.instrumentation import recompleted
@@ -128,8 +112,7 @@ class WindowEstimator:
         self._held = Held()
         self._valid_at: float | None = None
         self._watch, self._warnings = Watch(), Warnings()
-        self._curve: OverSlip | None = None
-        self._loss = NO_LOSS
+        self._curve: tuple[OverSlip | None, float] = None, -np.inf
         self._idle = np.zeros(len(self.rig.wheels), bool)
         self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
@@ -141,7 +124,7 @@ class WindowEstimator:
             hop=settings.hop,
         )  # fmt: skip
         if config.table is not None:
-            of_tracker = replace(of_tracker, min_rows=1)  # a table's rows are chosen with care, and few
+            of_tracker = replace(of_tracker, min_rows=1, instant=0.0)  # a table's rows are chosen with care, and few
         self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
         self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
         self._driven_rig = self.rig
@@ -167,7 +150,9 @@ class WindowEstimator:
             self._gain_names, self._gain_std = gains_of(self._driven_rig)
             self._tracker.start_from(before, since)
             self._predictions = PredictionWatch(self._settings.window)
-        window = task.window.rows(np.flatnonzero(task.window.t > self._engaged_at))
+        window = task.window
+        if len(window.t) and window.t[0] <= self._engaged_at:
+            window = window.rows(np.flatnonzero(window.t > self._engaged_at))
         return recompleted(window, self.rig, self._driven_rig)
 
     def solve(self, task: WindowTask) -> WindowResult:
@@ -189,7 +174,7 @@ class WindowEstimator:
         status, reason = self._status(task, tracked)
         own = posterior = None
         if fit is not None and status is not Status.INVALID:
-            own = posterior = fit.mode.posterior.widened(_widening(fit), self.prior)
+            own = posterior = fit.mode.posterior
             if fit.form is not None:
                 posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
         basis = self._basis(task, fit)
@@ -243,14 +228,12 @@ class WindowEstimator:
         """The result with traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
         self._update_watch(window)
-        self._curve = result.curve or self._curve
-        watch = with_loss(self._watch, self._loss)
-        warned = has_cause(watch, self._loss, self.config.warning.hold)
-        now = as_of(result, self._loss, result.t, self.config, warned)
-        if now.traversability.state is State.GO and watch.warning is Alert.IMMOBILISATION:
-            self._watch, self._warnings = ended(self._watch), self._warnings._replace(since=None)
-            watch = with_loss(self._watch, self._loss)
-        return replace(now, watch=watch, warnings=self._warnings)
+        if result.curve is not None:
+            self._curve = result.curve, result.t
+        now = as_of(result, self._watch, result.t, self.config)
+        if now.traversability.state is State.GO and self._watch.warning is Alert.IMMOBILISATION:
+            self._watch, self._warnings = ended(self._watch, self.config), self._warnings._replace(since=None)
+        return replace(now, watch=self._watch, warnings=self._warnings)
 
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
@@ -304,21 +287,19 @@ class WindowEstimator:
             self._predictions.take(task.end, tracked.prediction)
 
     def _update_watch(self, window: Undecided) -> None:
-        """Update loss of traction and watch by the last hop, with the curve of the window before."""
+        """Update the watch by the last hop, with the curve of the window before."""
         if window.fresh:
-            self._watch, self._curve, self._loss, self._warnings = Watch(), None, NO_LOSS, Warnings()
+            self._watch, self._curve, self._warnings = Watch(), (None, -np.inf), Warnings()
         self._warnings = self._warnings._replace(begun=())
         since = -math.inf if window.fresh else window.result.t - self._settings.hop
         driven = window.driven
         settings, chosen = self._settings, np.flatnonzero(driven.t > since)
         bins = bins_of_a_moment(settings.bin)
-        looks = moments(driven, self.rig, chosen, bins, settings.min_speed)
-        lately = motions(driven, self.rig, window.torque_limit, self.config.traversability, chosen, bins)
-        for moment, motion in zip(looks, lately, strict=True):
-            self._loss = observed(self._loss, motion, self.config)
-            inertia = moment.inertia - slope_felt(self._loss, self.rig)
-            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, inertia)
-            self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)
+        for moment in moments(driven, self.rig, window.torque_limit, self.config, chosen, bins):
+            curve, t = self._curve
+            known = curve if moment.t - t < WATCH.curve_age else None
+            self._watch = watched(self._watch, moment, known, self.config)
+            self._warnings = self._warnings.after(moment.t, self._watch.warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their fitted parameters, or without a fit as configured."""
@@ -331,9 +312,8 @@ class WindowEstimator:
         speed, fit = self._usual_speed(window), tracked.fit
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
-        widening = _widening(fit)
         return UncertainModel.of(
-            self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, fit.form
         )
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
@@ -396,12 +376,12 @@ class WindowEstimator:
 
     def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
         """The instants of a fit, and the distance driven since the last of them."""
-        instants = np.empty(0) if fit is None else fit.optimum.t
-        end = instants[-1] + self._settings.bin / 2.0 if len(instants) else -math.inf
+        instants, each = np.empty(0) if fit is None else fit.optimum.t, self._tracker.instant or self._settings.bin
+        end = min(instants[-1] + each / 2.0, task.end) if len(instants) else -math.inf
         since = task.window.ground_speed[task.window.t > end]
         known = since[np.isfinite(since)]
         unseen = float(known.mean()) * len(since) * self._settings.bin if len(known) else 0.0
-        return Basis(instants, self._settings.bin, unseen, task.late)
+        return Basis(instants, each, unseen, task.late)
 
     def _status(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         """Status and reason; a second sender or an implausible sensor replaces the reasons that it may have caused."""
@@ -472,8 +452,3 @@ def _soil_change(tracked: TrackerOutput) -> SoilChange:
 def _gated(tracked: TrackerOutput) -> str:
     """Reason for which most instants were left out: standstill or turning."""
     return "standstill" if tracked.standstill >= tracked.turning else "turning"
-
-
-def _widening(fit: Fit) -> float:
-    """Return the factor of a fit's covariance: its chi-square per residual where that is more than earlier ones."""
-    return max(fit.chi2, 1.0)

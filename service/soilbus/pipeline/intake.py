@@ -26,8 +26,8 @@ from soilbus.can.channels import Reason as Refusal
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
+from soilbus.decision.moments import Moment, moment_of
 from soilbus.decision.options import WATCH
-from soilbus.decision.traction_loss import Motion, motion_of
 from soilbus.estimation.assembly import Motor, Motors, delays_of, motors_of, rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import (
@@ -35,8 +35,6 @@ from soilbus.estimation.window import (
     WHEEL_QUANTITIES,
     Window,
     forward,
-    inertia_of,
-    pull_given,
     steady,
 )
 from soilbus.pipeline.corrections import NO_CORRECTIONS, Corrections
@@ -98,15 +96,13 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Means over the last `moment_span`: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
+    """Means over the last `moment_span`: slip by wheel, what the watch reads, draft [N] and pitch [rad] as measured.
 
-    And draft [N] and pitch [rad] as measured. None where not known.
+    None where not known.
     """
 
     slip: dict[str, float | None]
-    pull: float | None
-    inertia: float = 0.0
-    motion: Motion | None = None
+    moment: Moment | None = None
     draft: float | None = None
     pitch: float | None = None
 
@@ -436,26 +432,23 @@ class Intake:
         }
 
     def latest(self, now: float, corrections: Corrections = NO_CORRECTIONS) -> Latest:
-        """Slip, pull, motion, draft and pitch over the last `moment_span` before `now` [s].
+        """Slip, moment, draft and pitch over the last `moment_span` before `now` [s].
 
         corrections: of the last window.  Pitch and acceleration may be as old as the time-out of a channel.
         """
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
-            return Latest(dict.fromkeys(self.rig.wheels), None)
+            return Latest(dict.fromkeys(self.rig.wheels))
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
         raw = without(self._bins.glimpse(last - self._options.timeout, last), self.rig, set(self._implausible))
         measured, start = completed(forward(raw), self.rig), last - WATCH.moment_span
         recent = np.flatnonzero(measured.t > start)
         window, measured = corrections.corrected(steady(measured), self.rig).rows(recent), measured.rows(recent)
         if self.rig.chassis is None:
-            return Latest(self._slip(window), None)
-        pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
-        given = column_means(pull[:, None])[0]
+            return Latest(self._slip(window))
         limit = corrections.torque_limit(self._limits.at(now))
-        motion = motion_of(window, self.rig, limit, self._decision)
-        part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
+        moment = moment_of(window, self.rig, limit, self.config)
         draft, pitch = column_means(np.column_stack((measured.draft, measured.pitch)))
-        return Latest(self._slip(window), given, part, motion, draft, pitch)
+        return Latest(self._slip(window), moment, draft, pitch)
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         ground = window.ground_speed[:, None]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from cantools.database.can import Database
 
 from soilbus.config.model import Config, ConfigError
-from soilbus.decision.immobilisation import Watch
+from soilbus.decision.watch import Watch
 from soilbus.pipeline.result import WindowResult
 from soilbus.pipeline.states import state_after
 from soilbus.terra.soils import UNKNOWN

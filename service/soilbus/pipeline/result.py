@@ -1,7 +1,7 @@
 """The result of one window, and the same result some time later.
 
 WindowResult          estimate, status, decision and warning at the window's end
-as_of(result, now)    the decision overruled by age, distance and loss of traction since then
+as_of(result, now)    the decision overruled by age, distance and what the watch has seen since
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from soilbus.config.model import Config
-from soilbus.decision.immobilisation import Warnings, Watch
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import Status, Traversability
+from soilbus.decision.watch import Warnings, Watch
 from soilbus.pipeline.corrections import NO_CORRECTIONS, Corrections
 from soilbus.pipeline.determination import Excitation
 from soilbus.pipeline.positions import Position
@@ -150,23 +149,21 @@ class WindowResult:
         return able.over_slip if able is not None and fits else None
 
 
-def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool) -> WindowResult:
+def as_of(result: WindowResult, watch: Watch, now: float, config: Config) -> WindowResult:
     """The result at a later time.
 
     Parameters
     ----------
     result
         Of a window that has ended.
-    loss
-        Loss of traction as of now; a stuck vehicle has no valid result.
+    watch
+        As of now; a stuck vehicle has no valid result.
     now
         [s], the time of the data.
     config
         Limits of age and distance.
-    warned
-        Whether immobilisation is warned of.
     """
-    decision = at_present(result.traversability, result.basis, loss, now, config, warned)
-    if loss.stuck and result.status is Status.VALID:
+    decision = at_present(result.traversability, result.basis, watch, now, config)
+    if watch.stuck and result.status is Status.VALID:
         return replace(result, traversability=decision, status=Status.NOT_EXCITED, reason="standstill")
     return replace(result, traversability=decision)

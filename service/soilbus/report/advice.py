@@ -60,7 +60,7 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
             off = _mispredicted(windows)
             if what:
                 off += f"{what} is mapped for several wheels: if it is the cell of one, map it for that one alone; or "
-            return f"{off}check mass, radii, gear ratios, signs and slope; else {DIAGNOSE}"
+            return f"{off}check mass, radii, gear ratios, signs, slope and [noise]; else {DIAGNOSE}"
         case "no_convergence":
             return f"no soil explains these data ({_moved(windows)}): check signs and scales; else {DIAGNOSE}"
     return None

@@ -378,6 +378,17 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
         yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
 
 
+def wheel_derived_speed(data: ConsistencyInput) -> Iterator[str]:
+    """The ground speed, where it is the rim speed of an axle or of all wheels, which pull without any slip."""
+    options, every = data.options, list(range(len(data.rig.wheels)))
+    for wheels in (*data.rig.axles, every):
+        slip, grip = data.slip[:, wheels].mean(axis=1), data.traction[:, wheels].mean(axis=1)
+        slip = slip[(grip > options.driving_traction) & np.isfinite(slip)]
+        if len(slip) >= data.compared and median(np.abs(slip)) < options.no_slip:
+            yield "ground_speed"
+            return
+
+
 def _pulls(data: ConsistencyInput, where: Mask) -> bool:
     """Whether draft, slope and inertia ask the wheels to pull at these instants."""
     chassis = data.rig.chassis
@@ -552,6 +563,7 @@ def runs(holds: Mask) -> list[tuple[int, int]]:
 
 
 CHECKS: Sequence[Callable[[ConsistencyInput], Iterator[str]]] = (
-    frozen, standing_wheels, gear_ratio, load_sum, acceleration_sign, slip_without_traction, speed_scale, draft_sign,
+    frozen, standing_wheels, gear_ratio, load_sum, acceleration_sign, slip_without_traction, wheel_derived_speed,
+    speed_scale, draft_sign,
 )  # fmt: skip
 """In their order: what one names the next ones do not see."""

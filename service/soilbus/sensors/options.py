@@ -1,7 +1,7 @@
 """Options of what becomes of samples, and of the sensors' consistency: each value once, with its unit and evidence.
 
     ReceptionOptions   -> Intake, Bins, outliers, rates
-    ConsistencyOptions -> consistency.implausible, decision.traction_loss
+    ConsistencyOptions -> consistency.implausible, decision.driveline
 
 What a change of 30 % does to each is in service/docs/sensitivity.md.
 """
@@ -74,6 +74,10 @@ class ConsistencyOptions:
     either way finds the same faults."""
     feigned_slip: float = 0.12
     """Slip [1] that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
+
+    no_slip: float = 0.006
+    """Mean slip [1] of wheels below which a ground speed is made of their speeds while they surely drive: on asphalt
+    tyres slip by 0.006 to 0.01 at this traction (stiffness 16 to 25, Pacejka 2012, ch. 4), in fields by more."""
 
     load_error: float = 0.12
     """Share [1] of the weight by which the loads' sum must be wrong, and of an axle's load by which its left and right

@@ -23,6 +23,7 @@ from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import check_decodable
 from soilbus.can.role_matching import ASSERTED, WHEELS, Assignment, Candidate, Slot, axles_of
 from soilbus.can.units import STANDARD_GRAVITY
+from soilbus.sensors.facts import LIMITS
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 
 __all__ = ["Facts", "Recording", "facts_of", "recording_of", "weighed"]
@@ -233,7 +234,7 @@ def _kind(acceleration: Array, ground: Array, pitch: Array) -> str:
     slope = _smooth(pitch, width)
     rest = _smooth(acceleration, width) - np.gradient(_smooth(ground, width), BIN)
     known = np.isfinite(slope) & np.isfinite(rest)
-    if known.sum() < LEAST_BINS or slope[known].std() < 0.004:
+    if known.sum() < LEAST_BINS or slope[known].std() < LIMITS.tilted:
         return ""
     x = STANDARD_GRAVITY * (np.sin(slope[known]) - np.sin(slope[known]).mean())
     y = rest[known] - rest[known].mean()

@@ -102,8 +102,6 @@ class Solution(NamedTuple):
 class WheelEquations:
     """Eqs. 20-22 at one operating point, ready for any K_L, phi and n.
 
-    Raises ValueError for a sinkage that is not between 0 and the radius.
-
     Over the contact area r b theta1 (T: that times r) the forces are K_L (normal(n) +
     tan(phi) rubbed(n)) + c stuck.  The rear branch takes the front's stress (eqs. 5-9), so
     one power of the sinkage at each node gives all ten integrals, and their derivatives.
@@ -112,9 +110,7 @@ class WheelEquations:
     __slots__ = ("_of_c", "_rows", "_unit", "_z")
 
     def __init__(self, point: OperatingPoint, equations: Equations = SIMPSON) -> None:
-        z0, slip, r, width, c, K = point
-        if not 0.0 < z0 < r:
-            raise ValueError(f"a sinkage of {z0:g} m is not between 0 and the radius {r:g} m")
+        _, slip, r, width, c, K = point
         theta = entry_angle(point)
         share, weight, of_normal = _nodes(equations.rule)
         angle = theta * share
@@ -245,7 +241,9 @@ class WheelEquations:
 
 
 def entry_angle(point: OperatingPoint) -> float:
-    """Entry angle [rad] of the sinkage (eq. 1)."""
+    """Entry angle [rad] of the sinkage (eq. 1); ValueError for a sinkage that is not between 0 and the radius."""
+    if not 0.0 < point.sinkage < point.radius:
+        raise ValueError(f"a sinkage of {point.sinkage:g} m is not between 0 and the radius {point.radius:g} m")
     return math.acos(1.0 - point.sinkage / point.radius)
 
 

@@ -14,24 +14,22 @@ from tests.lab.peers.roster import OURS, Entry
 from tests.lab.peers.scores import QUANTITIES, Duel, Score, duel
 from tests.lab.peers.windows import Answer, Case, simulated_case
 
-Scores = dict[str, dict[Entry, Score]]
-"""By soil and entry."""
+Scores = dict[Entry, Score]
 
 
 def compared(
     entries: Sequence[Entry], soils: Sequence[str], windows: int, seed: int, step: Callable[[], None]
 ) -> Scores:
-    """Every entry on every window; `step` is called after each window."""
-    scores: Scores = {}
+    """Every entry on so many windows of each soil; `step` is called after each window."""
+    runs: dict[Entry, list[tuple[Answer | None, float]]] = {entry: [] for entry in entries}
     for number, name in enumerate(soils):
-        runs: dict[Entry, list[tuple[Answer | None, float]]] = {entry: [] for entry in entries}
         for i in range(windows):
             case = simulated_case(SOILS[name], 10_000 * seed + 1000 * number + i)
             for entry in entries:
                 runs[entry].append(timed(entry, case))
             step()
-        scores[name] = {e: Score(SOILS[name], *zip(*of, strict=True)) for e, of in runs.items()}
-    return scores
+    true = [SOILS[name] for name in soils for _ in range(windows)]
+    return {entry: Score(true, *zip(*of, strict=True)) for entry, of in runs.items()}
 
 
 def timed(entry: Entry, case: Case) -> tuple[Answer | None, float]:
@@ -43,20 +41,20 @@ def timed(entry: Entry, case: Case) -> tuple[Answer | None, float]:
     return answer, time.perf_counter() - begin
 
 
-def tables(scores: Scores) -> Iterator[str]:
-    """One table for each soil."""
-    for soil, of_soil in scores.items():
-        rows = [
-            (
-                e.name,
-                e.given,
-                f"{100.0 * s.failure_rate:.0f} %",
-                f"{s.milliseconds:.1f}",
-                *(cell(s, q) for q in QUANTITIES),
-            )
-            for e, s in of_soil.items()
-        ]
-        yield f"{soil}\n{table(('method', 'given', 'failed', 'ms', *QUANTITIES), rows)}"
+def comparison(scores: Scores) -> str:
+    """One table of all methods."""
+    who = {(entry, quantity): d.closer for entry, quantity, d in duels(scores)}
+    rows = [
+        (
+            entry.name,
+            entry.given,
+            f"{100.0 * score.failure_rate:.0f} %",
+            f"{score.milliseconds:.2g}",
+            *(f"{cell(score, q)} {who.get((entry, q), '')}".strip() for q in QUANTITIES),
+        )
+        for entry, score in scores.items()
+    ]
+    return table(("method", "given", "failed", "ms", *QUANTITIES), rows)
 
 
 def cell(score: Score, quantity: str) -> str:
@@ -70,62 +68,29 @@ def cell(score: Score, quantity: str) -> str:
     return f"{100.0 * score.rms(quantity):.2g} / {100.0 * score.median(quantity):.2g}{bars}"
 
 
-def duels(scores: Scores) -> Iterator[tuple[Entry, str, str, Duel]]:
-    """Peer, quantity, soil, and how it does against ours that is given the same exactly."""
-    for soil, of_soil in scores.items():
-        mine = {e.exact: s for e, s in of_soil.items() if e.name == OURS}
-        for entry, score in of_soil.items():
-            if entry.name == OURS:
-                continue
-            for quantity in score.quantities:
-                result = duel(score, mine[entry.exact], quantity) if entry.exact in mine else None
-                if result is not None:
-                    yield entry, quantity, soil, result
+def duels(scores: Scores) -> Iterator[tuple[Entry, str, Duel]]:
+    """Peer, quantity, and how it does against ours that is given the same exactly."""
+    mine = {entry.exact: score for entry, score in scores.items() if entry.name == OURS}
+    for entry, score in scores.items():
+        if entry.name == OURS:
+            continue
+        for quantity in score.quantities:
+            result = duel(score, mine[entry.exact], quantity) if entry.exact in mine else None
+            if result is not None:
+                yield entry, quantity, result
 
 
 def verdict(scores: Scores) -> str:
-    """Where peers win, by error and by time; computed from the scores alone."""
-    wins: dict[tuple[str, str, str], list[str]] = {}
-    tally: Counter[tuple[str, bool]] = Counter()
-    for entry, quantity, soil, d in duels(scores):
-        tally[d.better, d.by_chance] += 1
-        if d.better == "peer":
-            doubt = " (?)" if d.by_chance else ""
-            failed = scores[soil][entry].failure_rate
-            given = entry.given + (f", fails in {100.0 * failed:.0f} %" if failed else "")
-            won = f"{quantity} {100.0 * d.peer:.2g} < {100.0 * d.ours:.2g}{doubt}"
-            wins.setdefault((entry.name, given, soil), []).append(won)
-    rows = [(*of, ", ".join(won)) for of, won in wins.items()]
-    head = ("peer", "given", "soil", "RMS error, peer's < ours [%]; (?): may be chance, by a sign test")
-    text = "Where a peer beats ours that is given the same exactly (windows where both have a value)\n"
-    text += table(head, rows) if rows else "nowhere\n"
-    both = {who: (tally[who, False], tally[who, True]) for who in ("ours", "peer")}
-    alike = tally["neither", False] + tally["neither", True]
+    """How often ours and peers are closer; computed from the scores alone."""
+    closer = Counter(d.closer for _, _, d in duels(scores))
     return (
-        f"{text}\nOf {sum(tally.values())} comparisons by soil and quantity: ours is better in {both['ours'][0]} "
-        f"(and perhaps {both['ours'][1]} more), a peer in {both['peer'][0]} (and perhaps {both['peer'][1]} more), "
-        f"alike in {alike}.\n\n{_times(scores)}"
+        f"Of {closer.total()} comparisons ours is closer in {closer['ours']}, a peer in {closer['peer']}; "
+        f"{closer['alike']} are alike, {closer['open']} open.\n"
     )
 
 
 def ours_is_ahead(scores: Scores) -> bool:
-    """Whether ours has a value for every window, and is the better one as often as peers that are given the same."""
-    better = Counter(d.better for _, _, _, d in duels(scores))
-    failed = any(score.failure_rate > 0.0 for found in scores.values() for e, score in found.items() if e.name == OURS)
-    return not failed and better["ours"] >= better["peer"]
-
-
-def _times(scores: Scores) -> str:
-    """Median time of each method over ours."""
-    seconds: dict[str, list[float]] = {}
-    for of_soil in scores.values():
-        for entry, score in of_soil.items():
-            if not entry.exact:  # every method has such a row
-                seconds.setdefault(entry.name, []).extend(score.seconds)
-    median = {name: 1e3 * float(np.median(s)) for name, s in seconds.items()}
-    quick = [f"{name} {ms:.2g} ms" for name, ms in median.items() if ms < median[OURS]]
-    slow = [f"{name} {ms:.2g} ms ({ms / median[OURS]:.0f} times)" for name, ms in median.items() if ms > median[OURS]]
-    return (
-        f"Time for a window, median: ours {median[OURS]:.2g} ms. "
-        f"Faster: {', '.join(quick) or 'none'}. Slower: {', '.join(slow) or 'none'}.\n"
-    )
+    """Whether ours has a value for every window, and is closer more often than peers that are given the same."""
+    closer = Counter(d.closer for _, _, d in duels(scores))
+    failed = any(score.failure_rate > 0.0 for entry, score in scores.items() if entry.name == OURS)
+    return not failed and closer["ours"] > closer["peer"]

@@ -1,4 +1,4 @@
-"""Errors, failures, coverage and time of answers; who is better on what, and beyond chance or not."""
+"""Errors, failures, coverage and time of answers; who is closer on what, beyond chance."""
 
 from __future__ import annotations
 
@@ -27,23 +27,24 @@ def truth(soil: Soil, quantity: str) -> float:
 
 @dataclass(frozen=True)
 class Score:
-    """One method's answers on the windows of one soil, and the seconds each took."""
+    """One method's answers on windows, the true soil of each, and the seconds each took."""
 
-    soil: Soil
+    soils: Sequence[Soil]
     answers: Sequence[Answer | None]
     seconds: Sequence[float]
 
     @property
     def quantities(self) -> list[str]:
         """What the method estimates, in the table's order."""
-        found = {name for answer in self.answers if answer is not None for name in answer}
+        found = {name for _, answer in self._answered for name in answer}
         return [name for name in QUANTITIES if name in found]
 
     def errors(self, quantity: str) -> Array:
         """Relative errors (windows,), nan where there is no physical value."""
         value = np.array([a[quantity].value if a is not None and quantity in a else np.nan for a in self.answers])
+        true = np.array([truth(soil, quantity) for soil in self.soils])
         physical = np.isfinite(value) & (value > 0.0) & (value < HIGHEST.get(quantity, np.inf))
-        return np.where(physical, value / truth(self.soil, quantity) - 1.0, np.nan)
+        return np.where(physical, value / true - 1.0, np.nan)
 
     @property
     def failure_rate(self) -> float:
@@ -62,12 +63,15 @@ class Score:
 
     def coverage(self, quantity: str) -> float:
         """Share of windows whose 95 % interval, log-normal, holds the truth; nan without error bars."""
-        estimates = [a[quantity] for a in self.answers if a is not None and quantity in a]
-        value, std = np.array([(e.value, e.std) for e in estimates]).T
+        found = [(truth(soil, quantity), a[quantity]) for soil, a in self._answered if quantity in a]
+        true, value, std = np.array([(true, e.value, e.std) for true, e in found]).T
         if np.isnan(std).all():
             return np.nan
-        off = np.abs(np.log(value / truth(self.soil, quantity)))
-        return float(np.mean(off <= NORMAL_95 * std / value + 1e-12))
+        return float(np.mean(np.abs(np.log(value / true)) <= NORMAL_95 * std / value + 1e-12))
+
+    @property
+    def _answered(self) -> list[tuple[Soil, Answer]]:
+        return [(soil, answer) for soil, answer in zip(self.soils, self.answers, strict=True) if answer is not None]
 
     @property
     def milliseconds(self) -> float:
@@ -77,31 +81,34 @@ class Score:
 
 @dataclass(frozen=True)
 class Duel:
-    """A peer's and our RMS error of one quantity on the windows where both have a value; p of a sign test."""
+    """A peer's and our RMS error of one quantity on windows where both have a value, and who is closer in how many.
+
+    `closer_in` counts the windows in which the peer is closer, of `windows` in which one is: a missing value is not.
+    """
 
     peer: float
     ours: float
-    p: float
+    closer_in: int
+    windows: int
 
     @property
-    def better(self) -> str:
-        """ "peer" or "ours", whichever has the smaller RMS error; "neither" if they are all but the same."""
+    def closer(self) -> str:
+        """ "ours", "peer", "alike" (by RMS error), or "open" where a sign test of the windows does not confirm it."""
         if abs(self.peer - self.ours) <= ALIKE * max(self.peer, self.ours):
-            return "neither"
-        return "peer" if self.peer < self.ours else "ours"
-
-    @property
-    def by_chance(self) -> bool:
-        """Whether the windows, one by one, leave open which is better."""
-        return self.p >= SIGNIFICANT
+            return "alike"
+        peer = self.peer < self.ours
+        in_most = 2 * self.closer_in > self.windows
+        if peer != in_most or binomtest(self.closer_in, self.windows).pvalue >= SIGNIFICANT:
+            return "open"
+        return "peer" if peer else "ours"
 
 
 def duel(peer: Score, ours: Score, quantity: str) -> Duel | None:
     """Window against window; None where no window has both values."""
     pairs = np.abs([peer.errors(quantity), ours.errors(quantity)])
-    theirs, mine = pairs[:, np.isfinite(pairs).all(axis=0)]
-    if not len(theirs):
+    both = np.isfinite(pairs).all(axis=0)
+    if not both.any():
         return None
-    better, worse = int(np.sum(theirs < mine)), int(np.sum(theirs > mine))
-    p = float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
-    return Duel(float(np.sqrt(np.mean(theirs**2))), float(np.sqrt(np.mean(mine**2))), p)
+    peer_rms, our_rms = np.sqrt(np.mean(pairs[:, both] ** 2, axis=1)).tolist()
+    theirs, mine = np.nan_to_num(pairs, nan=np.inf)
+    return Duel(peer_rms, our_rms, int(np.sum(theirs < mine)), int(np.sum(theirs != mine)))

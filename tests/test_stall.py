@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from soilbus.config.model import Traversability, Warning
-from soilbus.decision.stall_forecast import LocalTrend, Sample, StallForecast, forecast
+from soilbus.decision.moments import Sample
+from soilbus.decision.trends import LocalTrend
+from soilbus.decision.watch import Stall, stalling
 
 G, STEP, LOOK = 9.81, 0.0005, 0.1
 
@@ -63,10 +65,10 @@ def drive(
 
 def warnings(samples: list[Sample], min_speed: float = 0.2) -> list[float]:
     """When warnings begin [s]."""
-    state, begun = StallForecast(), []
+    state, begun = Stall(), []
     for sample in samples:
-        later = forecast(state, sample, min_speed, Warning(), Traversability())
-        if later.stalls and not state.stalls:
+        later = stalling(state, sample, min_speed, Warning(), Traversability())
+        if later.ahead and not state.ahead:
             begun.append(sample.t)
         state = later
     return begun
@@ -150,14 +152,14 @@ def test_wheels_that_sink_to_their_limit_are_warned_of_while_the_vehicle_loses_l
 
 
 def test_a_specific_force_shows_the_slope_within_two_seconds_and_no_acceleration_in_its_place():
-    rng, state, V, found = np.random.default_rng(5), StallForecast(), 1.0, []
+    rng, state, V, found = np.random.default_rng(5), Stall(), 1.0, []
     for i in range(400):
         t = LOOK * i
         slope = 0.0 if t < 20.0 else 1.0
         rate = 0.4 * math.sin(0.8 * t)
         V += rate * LOOK
         sample = Sample(t, V + 0.01 * rng.standard_normal(), 1e-4, V, 1e-4, 0.2, felt=rate + slope)
-        state = forecast(state, sample, 0.2, Warning(), Traversability())
+        state = stalling(state, sample, 0.2, Warning(), Traversability())
         found.append(state.slope)
     assert max(abs(s) for s in found[20:200]) < 0.15
     assert max(abs(s - 1.0) for s in found[220:]) < 0.15

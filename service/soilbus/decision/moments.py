@@ -1,0 +1,268 @@
+"""What the watch reads ten times a second: slip, speeds, thrust and pull of one moment, from a short window of data.
+
+    slip velocity of a wheel   v_s = r omega - V           V: of the ground beside the wheel, on a curve too
+    resistance                 (sum(T / r) - pull) / (m g)
+    common slip                e^(-b s) = mean of e^(-b s_w)      mu = mu_max (1 - e^(-b s)) (Brixius 1987)
+
+Wheels on a differential share a torque: as load shifts between them, the lighter one gains more slip than the other
+loses, and their mean slip grows at the same pull.  The common slip, at which both would give what they give, hardly
+grows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.arrays import Array
+from soilbus.config.model import Config
+from soilbus.decision.options import WATCH
+from soilbus.estimation.window import Rig, Window, inertia_of, pairs, pull_given
+from soilbus.terra.vehicle import GRAVITY, slip_ratio
+
+__all__ = ["Moment", "Sample", "bins_of_a_moment", "common_slip", "moment_of", "moments"]
+
+
+class Sample(NamedTuple):
+    """One bin; nan where not known.
+
+    Attributes
+    ----------
+    t
+        [s].
+    ground, ground_var
+        [m/s], ground speed of the vehicle's middle, and its variance.
+    rim, rim_var
+        [m/s], mean rim speed of the driven wheels whose speed is known, and its variance.
+    thrust
+        Sum of torque over radius, as a share of the weight.
+    beside
+        [m/s], mean ground speed of those wheels less that of the middle: not zero on a curve with a side missing.
+    at_limit
+        Every motor whose limit is known is at its limit, and at least one limit is known.
+    depth, depth_var
+        [m], sinkage of the deepest wheel, and its variance.
+    felt
+        [m/s^2], dv/dt + g sin(pitch), where a specific force is measured and the pitch is not.
+    draft
+        As a share of the weight.
+    """
+
+    t: float
+    ground: float
+    ground_var: float
+    rim: float
+    rim_var: float
+    thrust: float
+    beside: float = 0.0
+    at_limit: bool = False
+    depth: float = math.nan
+    depth_var: float = math.nan
+    felt: float = math.nan
+    draft: float = math.nan
+
+
+class Moment(NamedTuple):
+    """Means over some bins; nan where not known.
+
+    Attributes
+    ----------
+    t
+        [s], of the last bin.
+    ground, rim, beside
+        [m/s], ground speed of the vehicle's middle, rim speed of each wheel that a motor can drive, and ground speed of
+        each of these less that of the middle (on a curve).
+    resistance
+        Thrust less draft, slope and inertia, as a share of the weight.
+    at_limit
+        Every motor whose limit is known is at its limit, and at least one limit is known.
+    slip
+        Torque-weighted mean of the driving wheels.
+    pull
+        [N], of draft, slope and inertia; nan where the acceleration is not measured.
+    last
+        The last bin by itself.
+    torque, reserve
+        [N m], of each of these wheels; whether it is known to be below its limit.
+    common, engaged
+        Common slip of the wheels that do drive, and which of all wheels these are.
+    given, inertia
+        [N], pull as far as it is measured, and the part of it that speeds the vehicle up.
+    mass
+        [kg], of the vehicle.
+    """
+
+    t: float
+    ground: float
+    rim: Sequence[float]
+    resistance: float
+    at_limit: bool
+    slip: float = math.nan
+    pull: float = math.nan
+    last: Sample | None = None
+    beside: Sequence[float] = ()
+    torque: Sequence[float] = ()
+    reserve: Sequence[bool] = ()
+    common: float = math.nan
+    engaged: tuple[bool, ...] = ()
+    given: float = math.nan
+    inertia: float = 0.0
+    mass: float = 0.0
+
+
+def common_slip(slips: Sequence[float], exponent: float = WATCH.slip_exponent) -> float:
+    """The slip at which all wheels would give the mean of what they give at their own slips.
+
+    Parameters
+    ----------
+    slips
+        Of one wheel or more, of like size.
+    exponent
+        b, growth of the traction ratio with slip.
+    """
+    least = min(slips)
+    mean = sum(math.exp(exponent * (least - slip)) for slip in slips) / len(slips)
+    return least - math.log(mean) / exponent
+
+
+def bins_of_a_moment(bin_length: float) -> int:
+    """Number of bins of a length [s] over which a moment's means go."""
+    return max(round(WATCH.moment_span / bin_length), 1)
+
+
+def moment_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], config: Config) -> Moment | None:
+    """The mean over a short forward window; None without a bin or a chassis.  Parameters as of `moments`."""
+    bins = len(window.t)
+    found = moments(window, rig, torque_limit, config, np.arange(bins)[-1:], bins)
+    return found[0] if found else None
+
+
+def moments(
+    window: Window, rig: Rig, torque_limit: NDArray[np.float64], config: Config, chosen: NDArray[np.intp], bins: int
+) -> list[Moment]:
+    """The means over the last bins at each of some bins of a forward window.
+
+    Parameters
+    ----------
+    window
+        A forward window.
+    rig
+        With a chassis and wheels, else there are no moments.
+    torque_limit
+        (W,) [N m], nan where not known, 0 of a wheel that rolls freely.
+    config
+        `full_torque`, share of the limit from which a motor is at its limit; `min_speed` [m/s], ground speed up to
+        which slip is nan.
+    chosen
+        (M,), the bins at which each mean ends.
+    bins
+        Over how many each mean goes, fewer at the window's begin.
+    """
+    if not len(chosen) or rig.chassis is None or not rig.wheels:
+        return []
+    drives, radius, mass = rig.drives, rig.radius, rig.chassis.mass
+    engaged = drives & ~(torque_limit <= 0.0)
+    speed, given = window.ground_speed, pull_given(window, rig.chassis)
+    moving = np.where(speed > config.estimator.min_speed, speed, np.nan)[:, None]
+    slips = slip_ratio(radius, window.speed, moving)
+    slips = np.where(slips > -1.0, slips, np.nan)
+    if rig.instrumentation is not None:
+        slips[:, rig.instrumentation.without_speed] = np.nan  # their speed is assumed
+    inertia = np.where(np.isfinite(given), inertia_of(window, rig.chassis), np.nan)
+    n, w = 4, len(radius)
+    columns = np.column_stack(
+        [speed, given, inertia, window.yaw_rate, radius * window.speed, window.torque, slips[:, engaged]]
+    )
+    place = chosen[:, None] + np.arange(1 - bins, 1)
+    there, place = place >= 0, np.maximum(place, 0)
+    known = np.isfinite(columns)
+    values, counts = np.where(known, columns, 0.0)[place], known[place]
+    accelerates = (np.isfinite(window.acceleration)[place] & there).any(axis=1)
+    if not there.all():
+        values[~there], counts[~there] = 0.0, False
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = values.sum(axis=1) / counts.sum(axis=1)
+        ground, given, inertia, yaw_rate = means[:, :n].T
+        rim, torque, slips = means[:, n : n + w], means[:, n + w : n + 2 * w], means[:, n + 2 * w :]
+        beside = _side(rig) * np.where(np.isfinite(yaw_rate), yaw_rate, 0.0)[:, None]
+        limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
+        full = torque >= config.traversability.full_torque * torque_limit
+        at_limit = limited.any() & (full | ~limited).all(axis=1)
+        resistance = ((torque / radius).sum(axis=1) - given) / (mass * GRAVITY)
+        weights = np.where((torque > 0.0) & (rim > 0.0) & drives, torque, 0.0)
+        slip = np.where(weights > 0.0, weights * (1.0 - (ground[:, None] + beside) / rim), 0.0)
+        slip = slip.sum(axis=1) / weights.sum(axis=1)
+    pull = np.where(accelerates, given, np.nan)
+    common = [common_slip(row) if (row := s[np.isfinite(s)].tolist()) else math.nan for s in slips]
+    of_wheels = (values[:, drives].tolist() for values in (rim, beside, torque, limited & ~full))
+    lasts = _samples(window.rows(chosen), rig, beside, at_limit)
+    scalars = (values.tolist() for values in (window.t[chosen], ground, resistance, at_limit, slip, pull))
+    forces, drive = zip(given.tolist(), np.nan_to_num(inertia).tolist(), strict=True), tuple(engaged.tolist())
+    return [
+        Moment(
+            t,
+            ground,
+            rim,
+            resistance,
+            at_limit,
+            slip,
+            pull,
+            last,
+            beside,
+            torque,
+            reserve,
+            same,
+            drive,
+            whole,
+            part,
+            mass,
+        )
+        for t, ground, resistance, at_limit, slip, pull, rim, beside, torque, reserve, last, same, (whole, part) in zip(
+            *scalars, *of_wheels, lasts, common, forces, strict=True
+        )
+    ]
+
+
+def _samples(window: Window, rig: Rig, beside: Array, at_limit: NDArray[np.bool_]) -> list[Sample]:
+    """Return each bin of a window of a rig with a chassis by itself; beside (N, W), at_limit (N,)."""
+    assert rig.chassis is not None  # `moments` sees to it
+    rim, of_rim = rig.radius * window.speed, rig.radius**2 * window.variance["speed"]
+    known = np.isfinite(rim) & np.isfinite(of_rim) & rig.drives
+    count, force = known.sum(axis=1), window.torque / rig.radius
+    pushes = np.isfinite(force)
+    thrust = np.where(pushes.any(axis=1), np.where(pushes, force, 0.0).sum(axis=1), np.nan)
+    depth, of_depth = window.sinkage, window.variance["sinkage"]
+    sunk = np.isfinite(depth) & np.isfinite(of_depth)
+    bin_, deepest = np.arange(len(depth)), np.where(sunk, depth, -np.inf).argmax(axis=1)
+    depth, of_depth = (np.where(sunk, values, np.nan)[bin_, deepest] for values in (depth, of_depth))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, mean_beside = (np.where(known, values, 0.0).sum(axis=1) / count for values in (rim, beside))
+    weight = rig.chassis.mass * GRAVITY
+    columns = (
+        window.t,
+        window.ground_speed,
+        window.variance["ground_speed"],
+        mean,
+        np.where(known, of_rim, 0.0).sum(axis=1) / np.maximum(count, 1) ** 2,
+        thrust / weight,
+        np.where(count > 0, mean_beside, 0.0),
+        at_limit,
+        depth,
+        of_depth,
+        np.where(np.isnan(window.pitch) & window.kinematic, window.acceleration, np.nan),
+        window.draft / weight,
+    )
+    return list(map(Sample, *(column.tolist() for column in columns)))
+
+
+def _side(rig: Rig) -> Array:
+    """Lever [m] (W,) by which a yaw rate, positive to the left, adds to a wheel's ground speed; 0 without a track."""
+    lever = np.zeros(len(rig.wheels))
+    if rig.track is not None:
+        left, right = pairs(rig)
+        lever[left], lever[right] = -rig.track / 2.0, rig.track / 2.0
+    return lever

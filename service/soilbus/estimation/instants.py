@@ -1,0 +1,78 @@
+"""Instants: means of a window's bins over whole cycles of a machine that shakes.
+
+    y_i = mean of the known y_b,    var y_i = sum of var y_b / n^2         n bins b of an instant i
+
+A model of steady wheels holds in the mean of a cycle only.  Within one, loads, slips and torques also follow each other
+by relaxation, inertia and filters.  What these leave of a fit passes for curvature of torque over slip, and so for
+less tan phi.  Instants are counted back from the window's end: windows a whole number of instants apart share theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.arrays import Array
+from soilbus.estimation.window import TIME_TOLERANCE, VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window
+
+__all__ = ["averaged"]
+
+_QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+
+
+def averaged(window: Window, end: float, length: float) -> Window:
+    """Return the window with the means of its bins over instants of this length [s], counted back from `end` [s].
+
+    Parameters
+    ----------
+    window : Window
+        Bin means and variances; nan where unknown.
+    end : float
+        Time [s] at which the last instant ends.
+    length : float
+        Of an instant; 0 returns the window itself.
+
+    Returns
+    -------
+    Window
+        A value is known where one of its bins is.
+    """
+    if not length or not len(window.t):
+        return window
+    number = np.floor((end - window.t + TIME_TOLERANCE) / length)
+    starts = np.flatnonzero(np.diff(number, prepend=np.inf))
+    if len(starts) == len(window.t):
+        return window
+    given = window.observations
+    values, variances = [getattr(window, q) for q in _QUANTITIES], [window.variance[q] for q in _QUANTITIES]
+    if given is not None:
+        values += [given.torque, given.value, given.by_inertia, given.by_draft]
+        variances += [given.torque_var, given.variance]
+    value, variance = _means(values, starts, 1), _means(variances, starts, 2)
+    n = len(_QUANTITIES)
+    if given is not None:
+        torque, latents, by_inertia, by_draft = value[n:]
+        given = type(given)(torque, variance[n], latents, variance[n + 1], by_inertia, by_draft)
+    direction, each = window.direction, np.diff(starts, append=len(window.t))
+    return replace(
+        window,
+        t=np.add.reduceat(window.t - end, starts) / each + end,
+        variance=dict(zip(_QUANTITIES, variance, strict=False)),
+        observations=given,
+        direction=np.sign(np.add.reduceat(direction, starts)) if len(direction) else direction,
+        **dict(zip(_QUANTITIES, value, strict=False)),  # type: ignore[arg-type]
+    )
+
+
+def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:
+    """Return sums of the known rows from each start on, over a power of their number, for columns (N,) or (N, C)."""
+    values = np.column_stack(columns)
+    known = np.isfinite(values)
+    count = np.add.reduceat(known.astype(float), starts, axis=0)
+    total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
+    means = np.where(count > 0.0, total / np.maximum(count, 1.0) ** power, np.nan)
+    ends = np.cumsum([1 if column.ndim == 1 else column.shape[1] for column in columns])
+    parts = np.split(means, ends[:-1], axis=1)
+    return [part[:, 0] if column.ndim == 1 else part for part, column in zip(parts, columns, strict=True)]

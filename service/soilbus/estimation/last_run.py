@@ -1,0 +1,69 @@
+"""Prior of a run from the end of the last one: the gains that its sensors had then, where the data agree with them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.options import ESTIMATOR
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+
+__all__ = ["passes_prior_conflict_test", "prior_from_last_run"]
+
+_SOIL = len(PARAMETERS)
+
+
+def prior_from_last_run(
+    gaussian: Gaussian,
+    soil: SoilPrior,
+    gain_std: Array,
+    elapsed: float,
+    correlation_time: float = ESTIMATOR.tracker.gain_correlation_time,
+) -> Gaussian:
+    """Joint prior of a run from the posterior of the last one: the soil's prior, and gains drawn back to theirs.
+
+    Parameters
+    ----------
+    gaussian : Gaussian
+        Posterior at the end of the last run.
+    soil : SoilPrior
+        Prior of the soil; the vehicle may stand on another one now.
+    gain_std : Array
+        Prior sd of the gains (G,).
+    elapsed : float
+        Time since then [s].
+    correlation_time : float
+        [s], `TrackerOptions.gain_correlation_time`.
+
+    Returns
+    -------
+    Gaussian
+        Gains k g with variance k^2 var + (1 - k^2) gain_std^2, k = exp(-elapsed / correlation_time).
+
+    References
+    ----------
+    Gain errors as a stationary process: Uhlenbeck & Ornstein 1930, Phys. Rev. 36, 823.
+    """
+    kept = math.exp(-elapsed / correlation_time) * (gain_std > 0.0)
+    covariance = np.zeros_like(gaussian.covariance)
+    covariance[:_SOIL, :_SOIL] = np.diag(soil.log_std**2)
+    of_gains = kept[:, None] * gaussian.covariance[_SOIL:, _SOIL:] * kept
+    covariance[_SOIL:, _SOIL:] = of_gains + np.diag((1.0 - kept**2) * gain_std**2)
+    return Gaussian(soil.median, kept * gaussian.gains, covariance)
+
+
+def passes_prior_conflict_test(problem: ObservationModel, soil: SoilPrior, joint_prior: Gaussian) -> bool:
+    """Whether a window's evidence with the gains of the last run is at least that with their prior alone.
+
+    A sensor exchanged or calibrated since then has another gain error and fails the test.
+    """
+    other = fit_window(problem, soil, Gaussian.of(soil, problem.gain_std))
+    fit = fit_window(problem, soil, joint_prior)
+    if fit is None or not fit.converged:
+        return False
+    return other is None or not other.converged or fit.neg2_log_evidence <= other.neg2_log_evidence
