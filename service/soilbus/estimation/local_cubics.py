@@ -9,7 +9,8 @@ smoothed value.  A channel that varies slowly is averaged over many samples, one
 
 from __future__ import annotations
 
-from functools import cache
+import math
+from functools import cache, lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -163,8 +164,32 @@ def variance_of_one(half: int, n: int, parts: int) -> float:
     The value is the mean of the samples less the curve's mean there, plus the curve at the
     instant, which is `parts` / `PHASE_PARTS` steps after the middle of the samples.
     """
-    weights, reach = _cubics(half).weights[:, half], half + n + 2
-    nothing = np.zeros((3, 2 * reach + n))
+    rest, value, _ = _weights(half, n, parts / PHASE_PARTS, half + n + 2)
+    return float(((rest + value) ** 2).sum())
+
+
+@lru_cache(256)
+def kept_noise(half: int, n: int, phase: float, ahead: float, lag: float) -> float:
+    """Return the factor c by which a shift of n samples leaves their noise as large as it is.
+
+        var(c e + s(phase + ahead) + lag s'(phase + ahead)) = var(e + s(phase))        e: samples less their curve s
+
+    With 1 the curve's noise adds to the samples' or cancels some of it, and some shift seems to fit better.  All are in
+    steps, phase is that of the instant after the middle of its samples.
+    """
+    reach = half + n + 2 + math.ceil(abs(phase) + abs(ahead))
+    (rest, now, _), (_, value, slope) = (_weights(half, n, at, reach) for at in (phase, phase + ahead))
+    moved = value + lag * slope
+    own, shared, rise = rest @ rest, rest @ moved, moved @ moved - ((rest + now) ** 2).sum()
+    return float((math.sqrt(max(shared**2 - own * rise, 0.0)) - shared) / own)
+
+
+def _weights(half: int, n: int, ahead: float, reach: int) -> tuple[Array, Array, Array]:
+    """Return weights of samples in what n of them have beside their curve, in its value, and in its slope by step.
+
+    Value and slope are `ahead` steps after the middle of the n samples, of which the first has index `reach`.
+    """
+    weights, nothing = _cubics(half).weights[:, half], np.zeros((3, 2 * reach + n))
 
     def weights_of(index: int) -> Array:
         """Weights (3, samples) in the curve's value, slope and second derivative at one sample."""
@@ -174,13 +199,12 @@ def variance_of_one(half: int, n: int, parts: int) -> float:
 
     own = np.zeros(nothing.shape[1])
     own[reach : reach + n] = 1.0 / n
-    middle = (n - 1) / 2.0 + parts / PHASE_PARTS
-    index = int(np.floor(middle))
-    share = np.full(len(own), middle - index)
+    middle = (n - 1) / 2.0 + ahead
+    index = math.floor(middle)
+    share, one, first = np.full(len(own), middle - index), np.ones(len(own)), np.zeros(1, np.intp)
     both = np.stack([weights_of(index), weights_of(index + 1)])
-    curve_weights = _hermite(share, np.ones(len(own)), both[:, 0], both[:, 1], np.zeros(1, np.intp))[0]
-    residual_weights = own - np.mean([weights_of(i)[0] for i in range(n)], axis=0)
-    return float(((residual_weights + curve_weights) ** 2).sum())
+    value, slope = (_hermite(share, one, both[:, k], both[:, k + 1], first)[0] for k in range(2))
+    return own - np.mean([weights_of(i)[0] for i in range(n)], axis=0), value, slope
 
 
 def powers(steps: Array) -> Array:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
-from soilbus.estimation.local_cubics import Series, curve_of
+from soilbus.estimation.local_cubics import Curve, Series, curve_of, kept_noise
 from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -159,7 +159,7 @@ class Measurements:
         self.wheel_angle = wheel_rotation(self.t, self.speed)
         self._balance(take, usable)
         self.gain_names, gain_std = gains_of(rig)
-        self.gain_std = np.array(gain_std)
+        self.gain_std = self.sensor_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
         self.slip = np.where(self.rolls, rig.options.measurements.rolling_slip, slip[kept])
         self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
@@ -228,7 +228,7 @@ class Measurements:
         late = [name.removeprefix("lateness.") for name in STANDING[2:]]
         half = [self.sample_time(quantity) / 2.0 for quantity in [*late, *["torque"] * W]]
         stamped.gain_names = [*self.gain_names[: self.n_sensors], *(f"lateness.torque.{w}" for w in self.rig.wheels)]
-        stamped.gain_std = np.concatenate([self.gain_std[: first + 2], half])
+        stamped.gain_std = stamped.sensor_std = np.concatenate([self.sensor_std[: first + 2], half])
         stamped.n_sensors = len(stamped.gain_names)
         return stamped
 
@@ -411,6 +411,21 @@ class Measurements:
         names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
         curves = self._curves.window.curves
         return max((curves[name].smooth.step for name in names if name in curves), default=0.0)
+
+    def shifted(self, quantity: str, column: int, curve: Curve, delay: float, tau: float) -> Array:
+        """Return by how much a column of a quantity (N,) changes where a delay and a low pass [s] are taken out."""
+        t, now = self._curves.window.t, curve.at(self.t)[0]
+        value, slope, _ = curve.at(self.t + delay)
+        if not curve.half_width:
+            return value + tau * slope - now
+        length = float(np.median(np.diff(t)))
+        first, end = (np.searchsorted(curve.t, self.t + part * length) for part in (-0.5, 0.5))
+        n = max(round(float(np.median(end - first))), 1)
+        middle = np.median(self.t - (curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step))
+        phase, ahead, lag = (float(x) / curve.step for x in (middle, delay, tau))
+        kept = kept_noise(curve.half_width, n, round(phase, 2), ahead, lag)
+        measured = getattr(self._curves.window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
+        return np.asarray(value + tau * slope - now + (kept - 1.0) * (measured - now))
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""

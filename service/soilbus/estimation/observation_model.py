@@ -811,9 +811,21 @@ class ObservationModelWithEffects(ObservationModel):
         self._named = {effect.name: effect for effect in self.effects}
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
-        self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
+        self.gain_std = np.concatenate([self._sensor_std(), std])
         bounds = np.array([f.bounds for f in self.free]).reshape(-1, 2)
         self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
+
+    def _sensor_std(self) -> Array:
+        """Return the prior sd of the sensors' gains; a channel that an effect delays has no lateness beside it.
+
+        Two shifts of opposite sign would leave a second difference, which takes up noise.
+        """
+        fitted = {(f.effect, f.parameter.name) for f in self.free if f.std > 0.0}
+        late = [q for e in self.effects for q, names in e.late.items() if (e.name, names.delay) in fitted]
+        names, std = [name.split(".") for name in self.gain_names[: self.n_sensors]], self.sensor_std.copy()
+        for quantity in late:  # of torques the first one's: the others' may differ from it
+            std[next((i for i, name in enumerate(names) if name[:2] == ["lateness", quantity]), len(std)) :][:1] = 0.0
+        return std
 
     def active(self, standardised: Array) -> list[Active]:
         """The effects with their values at standardised parameters (P,)."""
@@ -964,11 +976,11 @@ class ObservationModelWithEffects(ObservationModel):
 
         Notes
         -----
-        y(t + d) = y(t) + s(t + d) - s(t) with the smooth curve s of the measurements (see
-        local_cubics): the noise of an instant stays with it, else every delay would pair other
-        noises and some delay would seem to fit better.  Torques are predicted by the model: there
-        the low pass and the derivatives act on the prediction, since slopes of measurements have
-        noise that would count as information.
+        y(t + d) = s(t + d) + c (y(t) - s(t)) with the smooth curve s of the measurements (see
+        local_cubics): the noise of an instant stays with it, and c keeps its variance.  Else every
+        delay would pair other noises or cancel a part, and some would seem to fit better.
+        Torques are predicted by the model: there the low pass and the derivatives act on the
+        prediction, since slopes of measurements have noise that would count as information.
         """
         places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
         standardised, P = gains[self.layout.effects], len(self.free)
@@ -988,8 +1000,8 @@ class ObservationModelWithEffects(ObservationModel):
                     tau, std, of_tau = 0.0, 0.0, 0.0
                 for column, series in enumerate(self._curves.of(quantity)):
                     curve = series.faithful if quantity == "torque" else series.smooth
-                    value, slope, second = curve.at(self.t + d)
-                    added[:, column] += np.nan_to_num(value - curve.at(self.t)[0] + tau * slope)
+                    _, slope, second = curve.at(self.t + d)
+                    added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d, tau))
                     by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
                     by[at[1], :, column] += of_tau * np.nan_to_num(slope)
         if not found:
