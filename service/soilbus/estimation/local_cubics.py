@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.terra.effects.along import through_low_pass
 
 HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 """Numbers of samples on each side that are tried; with two a cubic averages at all."""
@@ -168,20 +169,31 @@ def variance_of_one(half: int, n: int, parts: int) -> float:
     return float(((rest + value) ** 2).sum())
 
 
+class Instants(NamedTuple):
+    """Samples of an instant, steps from their middle to it, and the half width of the curve that its value is by."""
+
+    samples: int
+    phase: float
+    half: int
+
+
 @lru_cache(256)
-def kept_noise(half: int, n: int, phase: float, ahead: float, lag: float) -> float:
-    """Return the factor c by which a shift of n samples leaves their noise as large as it is.
+def kept_noise(half: int, instants: Instants, ahead: float, lag: float, low_pass: float = 0.0) -> float:
+    """Return the factor c by which a shift along a curve s leaves the noise of instants y as large as it is.
 
-        var(c e + s(phase + ahead) + lag s'(phase + ahead)) = var(e + s(phase))        e: samples less their curve s
+        var(c (y - s(0)) + s(ahead) + lag s'(ahead)) = var(y)        ahead, lag, low_pass (that s passes) in steps
 
-    With 1 the curve's noise adds to the samples' or cancels some of it, and some shift seems to fit better.  All are in
-    steps, phase is that of the instant after the middle of its samples.
+    With 1 the curve's noise adds to that of y or cancels some of it, and some shift seems to fit better.
     """
-    reach = half + n + 2 + math.ceil(abs(phase) + abs(ahead))
-    (rest, now, _), (_, value, slope) = (_weights(half, n, at, reach) for at in (phase, phase + ahead))
-    moved = value + lag * slope
-    own, shared, rise = rest @ rest, rest @ moved, moved @ moved - ((rest + now) ** 2).sum()
-    return float((math.sqrt(max(shared**2 - own * rise, 0.0)) - shared) / own)
+    n, phase, of_value = instants
+    reach = max(half, of_value) + n + 2 + math.ceil(abs(phase) + abs(ahead) + 5.0 * low_pass)
+    rest, now, _ = _weights(of_value, n, phase, reach)
+    (_, here, _), (_, value, slope) = (_weights(half, n, at, reach) for at in (phase, phase + ahead))
+    moved = (value + lag * slope)[::-1, None]  # a low pass looks back, at weights of samples before
+    moved = through_low_pass(np.arange(float(len(moved))), moved, low_pass)[::-1, 0]
+    off, total = rest + now - here, rest + now
+    own, shared, rise = (float(x) for x in (off @ off, off @ moved, moved @ moved - total @ total))
+    return (math.sqrt(max(shared**2 - own * rise, 0.0)) - shared) / own
 
 
 def _weights(half: int, n: int, ahead: float, reach: int) -> tuple[Array, Array, Array]:

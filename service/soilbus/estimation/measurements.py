@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
-from soilbus.estimation.local_cubics import Curve, Series, curve_of, kept_noise
+from soilbus.estimation.local_cubics import Curve, Instants, Series, curve_of, kept_noise
 from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -414,18 +414,29 @@ class Measurements:
 
     def shifted(self, quantity: str, column: int, curve: Curve, delay: float, tau: float) -> Array:
         """Return by how much a column of a quantity (N,) changes where a delay and a low pass [s] are taken out."""
-        t, now = self._curves.window.t, curve.at(self.t)[0]
         value, slope, _ = curve.at(self.t + delay)
-        if not curve.half_width:
-            return value + tau * slope - now
-        length = float(np.median(np.diff(t)))
+        off, kept = self.off_curve(quantity, column, curve), self.kept_noise(quantity, column, curve, delay, tau)
+        return np.asarray(value + tau * slope - curve.at(self.t)[0] + (kept - 1.0) * off)
+
+    def off_curve(self, quantity: str, column: int, curve: Curve) -> Array:
+        """Return what a column of a quantity has beside its curve (N,)."""
+        t = self._curves.window.t
+        values = getattr(self._curves.window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
+        return np.asarray(values - curve.at(self.t)[0])
+
+    def kept_noise(
+        self, quantity: str, column: int, curve: Curve, delay: float, tau: float, low_pass: float = 0.0
+    ) -> float:
+        """Return the factor on what is beside a curve, with which a shift [s] keeps the noise of instants."""
+        of_value = self._curves.of(quantity)[column].smooth.half_width
+        if not (curve.half_width and of_value and self.n > 1):
+            return 1.0
+        length = float(np.median(np.diff(self._curves.window.t)))
         first, end = (np.searchsorted(curve.t, self.t + part * length) for part in (-0.5, 0.5))
         n = max(round(float(np.median(end - first))), 1)
-        middle = np.median(self.t - (curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step))
-        phase, ahead, lag = (float(x) / curve.step for x in (middle, delay, tau))
-        kept = kept_noise(curve.half_width, n, round(phase, 2), ahead, lag)
-        measured = getattr(self._curves.window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
-        return np.asarray(value + tau * slope - now + (kept - 1.0) * (measured - now))
+        middle = curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step
+        phase, *steps = (x / curve.step for x in (float(np.median(self.t - middle)), delay, tau, low_pass))
+        return kept_noise(curve.half_width, Instants(n, round(phase, 2), of_value), *steps)
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""

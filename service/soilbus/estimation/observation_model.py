@@ -999,7 +999,7 @@ class ObservationModelWithEffects(ObservationModel):
                     by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
                     tau, std, of_tau = 0.0, 0.0, 0.0
                 for column, series in enumerate(self._curves.of(quantity)):
-                    curve = series.faithful if quantity == "torque" else series.smooth
+                    curve = series.smooth
                     _, slope, second = curve.at(self.t + d)
                     added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d, tau))
                     by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
@@ -1044,16 +1044,30 @@ class ObservationModelWithEffects(ObservationModel):
             if len(load.t) < 2 or np.count_nonzero(used) < 2 * len(_TORQUE_POWERS):
                 continue
             states = np.stack([latents.load[used, w], slip[used, w]])
-            rim = np.maximum(self.rig.radius[w] * speed.at(load.t)[0], 1e-3)
-            path = np.clip(np.stack([load.value, 1.0 - ground.at(load.t)[0] / rim]).T, *np.sort(states)[:, [0, -1]].T)
             middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
             basis = _monomials((states - middle) / size)
             by_power = np.linalg.lstsq(basis, torque[used, w], rcond=None)[0]
-            along = _monomials((path.T - middle) / size) @ by_power
+
+            def along_at(latents: Array, w: int = w, states: Array = states, by_power: Array = by_power) -> Array:
+                """Torques (N,) at load, speed and ground speed (3, N)."""
+                rim = np.maximum(self.rig.radius[w] * latents[1], 1e-3)
+                path = np.clip(np.stack([latents[0], 1.0 - latents[2] / rim]).T, *np.sort(states)[:, [0, -1]].T).T
+                middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
+                return np.asarray(_monomials((path - middle) / size) @ by_power)
+
+            along = along_at(np.stack([load.value, speed.at(load.t)[0], ground.at(load.t)[0]]))
             filtered = through_low_pass(load.t, along[:, None], tau)
             rate = (along[:, None] - filtered) / tau if tau > 0.0 else np.gradient(along, load.t)[:, None]
             behind = through_low_pass(load.t, rate, tau)
-            off[:, w] = np.interp(self.t, load.t, filtered[:, 0] - along) * used
+            change = np.interp(self.t, load.t, filtered[:, 0] - along)
+            curves = [("load", w, load), ("speed", w, speed), ("ground_speed", 0, ground)]
+            smooth = np.stack([curve.at(self.t)[0] for _, _, curve in curves])
+            for i, (quantity, column, curve) in enumerate(curves):  # noise stays as large as it is
+                noisy = smooth.copy()
+                noisy[i] += np.nan_to_num(self.off_curve(quantity, column, curve))
+                of_noise = along_at(noisy) - along_at(smooth)
+                change += (self.kept_noise(quantity, column, curve, 0.0, 0.0, tau) - 1.0) * of_noise
+            off[:, w] = np.nan_to_num(change) * used
             slope[:, w] = np.interp(self.t, load.t, rate[:, 0]) * used
             by_tau[:, w] = -np.interp(self.t, load.t, behind[:, 0]) * used
         return off, slope, by_tau

@@ -94,7 +94,7 @@ TORQUE_LAG = Effect(
     tells="quick changes of draft or speed; driving evenly hides it",
     parameters=(
         Parameter(_TORQUE.delay, "s", 0.0, 0.2, 0.0, 0.6),
-        Parameter(_TORQUE.time_constant, "s", 0.0, 0.2, 0.0, 2.0),
+        Parameter(_TORQUE.time_constant, "s", 0.0, 0.2, 0.0, 2.0, starts=(0.1,)),
     ),
     late={"torque": _TORQUE},
 )
