@@ -4,7 +4,7 @@ Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked
 not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
 
     follows      T - b (Q - Q') - T' (N / N' - 1) has no trend     b = T' / sum(T' / r): its share of the thrust
-    saturated    T - T' is noise, and T does not follow            a trend: a slope beyond what its residuals explain
+    saturated    T - T' is noise without trend, and T does not follow      a trend: a slope beyond its residuals
 
 What shakes the vehicle has no trend, however little its sensors say of their noise.
 A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
@@ -125,6 +125,7 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
         by_load = np.nan_to_num(mean * (window.load / window.load.mean(axis=0) - 1.0))
         spread = ((window.torque - mean) ** 2 / window.variance["torque"]).sum(axis=0)
         stands = spread <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
+        stands &= _trend(since, window.torque) <= deviations
         follows = [_trend(since, window.torque - by_pull - part) <= deviations for part in (0.0, by_load)]
     return np.asarray((share > 0.0) & stands & ~follows[0] & ~follows[1])
 

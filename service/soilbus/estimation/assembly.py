@@ -74,9 +74,11 @@ def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
     slip, computed = noise.pop("slip"), noise.pop("computed_load")
     noise["differential_lock"] = SensorNoise(absolute=1.0)
-    if of_table:  # its speeds are computed from the slip, see tables.py; a few steady rows have the noise that they say
+    if of_table:  # its speeds are computed from the slip, see tables.py
         noise |= {"speed": SensorNoise(), "ground_speed": slip}
-        options = replace(options, variance=replace(options.variance, least=1.0, most=1.0))
+        # its rows are no means of several bins, whose noise is less
+        steady = replace(options.tracker, several_soils=options.search.plausible_chi2)
+        options = replace(options, variance=replace(options.variance, least=1.0), tracker=steady)
     rig = Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),

@@ -82,6 +82,8 @@ class Settings:
         Time [s] from one window to the next.
     instant : float
         Length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins.
+    stated_noise : bool
+        Whether a first fit that leaves more than the stated noise is a mismatch: of rows without shaking or lateness.
     """
 
     window: float
@@ -94,6 +96,7 @@ class Settings:
     search_burst: float = 100.0
     hop: float = 1.0
     instant: float = ESTIMATOR.tracker.instant
+    stated_noise: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +277,7 @@ class Tracker:
             return TrackerOutput(None, False, TrackerState.STEADY, present.since, *left_out, reason=Reason.TOO_FEW_DATA)
         self._discard_before(end - self.settings.window)
         one = self._one_soil(present)
-        if not self._components.weight:
+        if not self._components.weight and not (self.settings.stated_noise and self.mismatch(one.fit)):
             present, one = self._with_components(present, window, end, one)
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)

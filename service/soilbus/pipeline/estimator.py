@@ -124,7 +124,7 @@ class WindowEstimator:
             hop=settings.hop,
         )  # fmt: skip
         if config.table is not None:
-            of_tracker = replace(of_tracker, min_rows=1, instant=0.0)  # a table's rows are chosen with care, and few
+            of_tracker = replace(of_tracker, min_rows=1, instant=0.0, stated_noise=True)  # rows are steady, and few
         self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
         self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
         self._driven_rig = self.rig
