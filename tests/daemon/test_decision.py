@@ -11,7 +11,6 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.watch import Watch
-from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask

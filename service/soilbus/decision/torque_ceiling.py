@@ -126,16 +126,20 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
         spread = ((window.torque - mean) ** 2 / window.variance["torque"]).sum(axis=0)
         stands = spread <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
         stands &= _trend(since, window.torque) <= deviations
-        follows = [_trend(since, window.torque - by_pull - part) <= deviations for part in (0.0, by_load)]
+        noise = window.variance["torque"].mean(axis=0)
+        follows = [_trend(since, window.torque - by_pull - part, noise) <= deviations for part in (0.0, by_load)]
     return np.asarray((share > 0.0) & stands & ~follows[0] & ~follows[1])
 
 
-def _trend(since: Array, values: Array) -> Array:
-    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959)."""
+def _trend(since: Array, values: Array, variance: Array | float = 0.0) -> Array:
+    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959).
+
+    The residuals have at least this variance.
+    """
     values, free = values - values.mean(axis=0), len(values) - 2
     spread = float((since**2).sum())
     slope = (since * values).sum(axis=0) / spread
-    rest = ((values - slope * since) ** 2).sum(axis=0) / free
+    rest = np.maximum(((values - slope * since) ** 2).sum(axis=0) / free, variance)
     share = (8.0 * free + 1.0) / (8.0 * free + 3.0)
     return np.asarray(share * np.sqrt(free * np.log1p(slope**2 * spread / rest / free)))
 
