@@ -94,7 +94,7 @@ class Log:
         if not self.wanted:
             mixed = f"{self.name}: frames of {_listed(others)} are read together; --channel chooses one"
             return mixed if len(others) > 1 else ""
-        if others:
+        if others and self.chosen:
             return (
                 f"{self.name}: frames of {self.chosen} are read; those of {_listed(others)} are left out"
                 " (bus.channel, --channel)"
