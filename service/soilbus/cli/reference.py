@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 from soilbus.cli.arguments import EXAMPLES, command_line, subcommands
 from soilbus.cli.effects import HEAD, parameter_rows
 from soilbus.config import model
-from soilbus.config.model import Column, Config, Noise, Prior, Signal
+from soilbus.config.model import Column, Config, Noise, Prior, RunningGear, Signal
 from soilbus.config.model import Effect as EffectTable
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
@@ -49,8 +49,9 @@ def configuration_page() -> str:
         " is an error. `soilbus check --config F` prints every setting in force. Any key can be overridden on the"
         " command line by `--set KEY=VALUE` with its dotted path.\n"
     )
-    for heading, section in (*_sections(Config, ""), *((value.__name__, value) for value in VALUES)):
-        rows = [_row(section, name, field) for name, field in section.model_fields.items()]
+    for heading, section in (*_sections(Config, ""), *((value.__name__, value) for value in (RunningGear, *VALUES))):
+        own = inspect.get_annotations(section)
+        rows = [_row(section, name, field) for name, field in section.model_fields.items() if name in own]
         text += f"\n## {heading}\n\n{inspect.getdoc(section)}\n\n| key | type | default | meaning |\n"
         text += "| --- | --- | --- | --- |\n" + "".join(rows)
     return text
@@ -96,8 +97,8 @@ def _type(annotation: Any) -> str:
         return names[annotation]
     if type(None) in parts:
         return _type(parts[0])
-    if getattr(annotation, "__origin__", None) in (list, dict):
-        return f"list of {_type(parts[0])}" if annotation.__origin__ is list else "table"
+    if getattr(annotation, "__origin__", None) in (list, tuple, dict):
+        return "table" if annotation.__origin__ is dict else f"list of {_type(parts[0])}"
     if parts and all(isinstance(part, (str, int)) for part in parts):
         return " or ".join(f"`{part!r}`".replace("'", '"') for part in parts)
     return _type(parts[0]) if parts else str(annotation)
@@ -113,6 +114,10 @@ def _value(default: Any) -> str:
 
 
 def _toml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
     return f'"{value}"' if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -133,16 +138,16 @@ def commands_page() -> str:
     """The help of every command."""
     text = (
         f"{GENERATED}# Commands\n\nExit codes: 0 done; 1 the work could not be done (one line on stderr); 2 wrong usage"
-        " or configuration. `--set KEY=VALUE` (dotted path, as in `--set soil.c.value=5000` or"
-        " `--set wheel.FL.radius=0.51`) overrides a value of the configuration in any command that takes `--config`."
-        " Without `--config` it is `soilbus.toml` in the current folder; `tractor`, `tractor-2wd` and `tractor-axles`"
-        " name reference machines. An output file is there whole or not at all; workers end with the command. \n\nLogs"
-        " are recognised by content, whatever their name: candump (`-L`, or its console output with stamps), SavvyCAN"
-        " (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite of python-can;"
-        " plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as UTC. Of a log with"
-        " several channels `bus.channel` is read, or `--channel`; the others are counted and said. `canN` is also the"
-        " channel numbered N + 1, or N in a log whose numbers begin at 0; a log of one other channel is read, with a"
-        " line that says so.\n\n"
+        " or configuration. An output file is there whole or not at all; workers end with the command.\n\n"
+        "`--config FILE` names the configuration, or a reference machine: `tractor`, `tractor-2wd`, `tractor-axles`."
+        " `--set KEY=VALUE` overrides a value by its dotted path, as in `--set soil.c.value=5000` or"
+        " `--set wheel.FL.radius=0.51`. Commands that take both say so, with the configuration that they take"
+        " otherwise.\n\nLogs are recognised by content, whatever their name: candump (`-L`, or its console output with"
+        " stamps), SavvyCAN (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite"
+        " of python-can; plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as"
+        " UTC. Of a log with several channels `bus.channel` is read, or `--channel`; the others are counted and said."
+        " `canN` is also the channel numbered N + 1, or N in a log whose numbers begin at 0; a log of one other channel"
+        " is read, with a line that says so.\n\n"
         "MF4 needs the extra `mf4`, zstd `tables`, `--report` `plots`, `bench` `peers`, `completion` the extra of its"
         " name.\n"
     )
@@ -153,14 +158,17 @@ def commands_page() -> str:
 
 
 def _arguments(command: argparse.ArgumentParser) -> str:
-    rows = []
+    rows, taken = [], ""
     for action in command._actions:
-        if isinstance(action, argparse._HelpAction):
+        if isinstance(action, argparse._HelpAction) or action.dest == "set":
+            continue
+        if action.dest == "config":
+            taken = f"Takes `--config` (default: {(action.help or '').rpartition('default: ')[2]}) and `--set`.\n\n"
             continue
         metavar = action.metavar if isinstance(action.metavar, str) else " ".join(action.metavar or ())
         shown = f"{', '.join(action.option_strings)} {metavar}".strip() or action.dest
         rows.append(f"| `{shown}`{' (required)' if action.required else ''} | {action.help or ''} |\n")
-    return "| argument | meaning |\n| --- | --- |\n" + "".join(rows) if rows else ""
+    return taken + ("| argument | meaning |\n| --- | --- |\n" + "".join(rows) if rows else "")
 
 
 def effects_page() -> str:
@@ -174,7 +182,10 @@ def effects_page() -> str:
 
 
 def _effect(effect: Effect) -> str:
-    rows = ([f"`{name}`", *others] for name, *others in parameter_rows(effect))
+    alike: dict[tuple[str, ...], list[str]] = {}  # of a spline, say: one row for all its knots
+    for name, *others in parameter_rows(effect):
+        alike.setdefault((name.rstrip("0123456789"), *others), []).append(f"`{name}`")
+    rows = ([", ".join(names), *others] for (_, *others), names in alike.items())
     return (
         f"\n## {effect.name}\n\n{effect.physics}\n\n*Shown by:* {effect.tells}\n\n*Source:* {effect.source}\n\n"
         + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["---"] * len(HEAD), *rows))

@@ -48,6 +48,7 @@ __all__ = [
     "NoiseOfChannels",
     "Output",
     "Prior",
+    "RunningGear",
     "Signal",
     "Signals",
     "SoilPrior",
@@ -246,10 +247,10 @@ class Vehicle(_Section):
     track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
     """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
     towing: Literal["measured", "never", "unknown"] = "measured"
-    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows in full:
-    `signals.draft` is not used then, and there is no GO."""
+    """Draft at the hitch: measured by `signals.draft`, never any, or unknown, which no sensor shows in full: then
+    `signals.draft` is not used and there is no GO."""
     steering: Literal["wheels", "skid"] = "wheels"
-    """By turned wheels, or by the speeds of the two sides, which lets the wheels slide sideways in every turn."""
+    """By turned wheels, or by the speeds of the two sides: then wheels slide sideways in every turn."""
     differential_lock: Signal | None = None
     """Above 0.5 while the differentials are locked; optional."""
 
@@ -282,7 +283,7 @@ class Vehicle(_Section):
 
 
 class SignalOfAcceleration(Signal):
-    """An accelerometer along the vehicle; `kind` says what it measures."""
+    """An accelerometer along the vehicle, with the keys of a Signal; `kind` says what it measures."""
 
     kind: Literal["kinematic", "specific_force"] = "kinematic"
     """dv/dt, or the specific force dv/dt + g sin(pitch) that an inertial sensor fixed to the vehicle feels."""
@@ -306,8 +307,8 @@ class Axle(_Section):
     differential: Literal["open", "locked", "limited"] = "open"
     """Open: the same torque left and right.  Locked: the same speed.  Limited: in between."""
     torque_bias: Annotated[NonNegativeFloat, AfterValidator(SHARE)] | None = None
-    """Sd of the difference of the two torques over their sum; by default 0.05 of an open differential (its friction:
-    bias ratio 1.1), 0.25 of one of limited slip (bias ratios of 2 to 3; Wong 2008, sect. 4.4)."""
+    """Sd of the difference of the two torques over their sum; by default 0.05 of an open differential (bias ratio 1.1),
+    0.25 of limited slip (bias ratios of 2 to 3; Wong 2008, sect. 4.4)."""
     max_torque: Annotated[PositiveFloat, AfterValidator(AXLE_TORQUE)] | None = None
     """Greatest torque at the axle [N m], where no signal reports it."""
     torque: Signal | None = None
@@ -320,19 +321,9 @@ class Axle(_Section):
     """Load on the axle [N]: load cell, or with `effective_area` the pressure of the air springs."""
 
 
-class Wheel(_Section):
-    """One wheel and its sensors; only the wheel of a test rig has no axle, and of an axle the left one stands first."""
+class RunningGear(_Section):
+    """Motor and sensors of a wheel, or of a track: "wheel" is then its sprocket."""
 
-    name: Name
-    """For messages, JSON and frames: FL, FR, RL, RR on a tractor, ML and MR between them on six wheels."""
-    axle: Name | None = None
-    """Axle that carries it: `front`, `middle`, `rear`, or the name of an [[axle]]."""
-    radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
-    """Rolling radius [m]."""
-    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
-    """Of the tyre [m]."""
-    tyre: Literal["flexible", "rigid"] = "flexible"
-    """A rigid wheel has no tyre that could flatten or wear."""
     driven: bool = True
     """false: it rolls freely, without any torque but the drag of its bearing."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
@@ -344,13 +335,31 @@ class Wheel(_Section):
     speed: Signal | None = None
     """Rotation [rad/s], at the wheel or the shaft."""
     load: Signal | None = None
-    """Load cell [N]."""
+    """Load cell [N]; without, the load follows from the vehicle's weight."""
     sinkage: Signal | None = None
-    """Depth of the rut below the wheel [m]; optional."""
+    """Depth of the rut [m]; optional."""
     torque_limit: Signal | None = None
     """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
     """Only to find a faulty speed sensor."""
+
+
+class Wheel(RunningGear):
+    """One wheel, with the keys of a RunningGear.
+
+    Only the wheel of a test rig has no axle; of an axle the left one stands first.
+    """
+
+    name: Name
+    """For messages, JSON and frames: FL, FR, RL, RR on a tractor, ML and MR between them on six wheels."""
+    axle: Name | None = None
+    """Axle that carries it: `front`, `middle`, `rear`, or the name of an [[axle]]."""
+    radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
+    """Rolling radius [m]."""
+    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    """Of the tyre [m]."""
+    tyre: Literal["flexible", "rigid"] = "flexible"
+    """A rigid wheel has no tyre that could flatten or wear."""
 
     _contact_length: float = PrivateAttr(0.0)
 
@@ -377,11 +386,12 @@ def _check_free(part: Wheel | Track, section: str) -> None:
         raise ValueError(f"{section} {part.name} has driven = false and a {of_motor[0]}: leave out one of the two")
 
 
-class Track(_Section):
-    """One track and its sensors, the left one first; its pressure on the ground is uniform, or peaks below its rollers.
+class Track(RunningGear):
+    """One track, the left one first, with the keys of a RunningGear.
 
-    Tracks alone carry the whole vehicle: its `wheelbase` is then their contact length, and it steers by `skid`, unless
-    [vehicle] says otherwise.  With wheels, or on both axles, a track takes the place of the wheel of its axle.
+    Pressure on the ground is uniform, or peaks below its rollers.  Tracks alone carry the whole vehicle: its
+    `wheelbase` is then their contact length, and it steers by `skid`, unless [vehicle] says otherwise.  With wheels, or
+    on both axles, a track takes the place of the wheel of its axle.
     """
 
     name: Name
@@ -399,26 +409,8 @@ class Track(_Section):
     sprocket_teeth: PositiveInt | None = None
     """Links that one turn of the sprocket moves."""
     roller_spacing: Annotated[PositiveFloat, AfterValidator(WIDTH)] | None = None
-    """From one road roller to the next [m], where pressure peaks below each: p (1 + cos(2 pi x / spacing)), as below
-    short links and rollers far apart (Wills 1963).  Without, pressure is uniform."""
-    driven: bool = True
-    """false: no motor drives it."""
-    gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
-    """Turns of the motor shaft for one of the sprocket."""
-    max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
-    """The motor's limit at the sprocket [N m], where no signal reports it."""
-    torque: Signal | None = None
-    """Motor torque [N m], at the sprocket ("wheel") or the shaft."""
-    speed: Signal | None = None
-    """Rotation [rad/s], at the sprocket ("wheel") or the shaft."""
-    load: Signal | None = None
-    """Load cell [N]; without, the load follows from the vehicle's weight."""
-    sinkage: Signal | None = None
-    """Depth of the rut [m]; optional."""
-    torque_limit: Signal | None = None
-    """Greatest torque that the motor reports it can give [N m]; optional."""
-    motor_speed: Signal | None = None
-    """Only to find a faulty speed sensor."""
+    """From one road roller to the next [m], where pressure peaks below each by p (1 + cos(2 pi x / spacing)) (Wills
+    1963).  Without, pressure is uniform."""
 
     def as_wheel(self) -> Wheel:
         """The rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
@@ -606,10 +598,9 @@ class NoiseOfChannels(_Section):
     steering_angle: Noise = Noise(absolute=0.02)
     """[rad]."""
     computed_load: Noise = Noise(relative=0.12, gain=0.02)
-    """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
-    rms of what bouncing, pitching and rolling on uneven ground add to a wheel's load, over it, and the fixed error of
-    the share left and right.  Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (the field
-    vehicle's: 12 %)."""
+    """Load that no cell measures: rms of what uneven ground adds to a wheel's load, over it, and the fixed error of the
+    share left and right.  What mass, centre of gravity, pitch, acceleration and draft leave open comes besides.
+    Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (the field vehicle's: 12 %)."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
@@ -703,41 +694,40 @@ class Estimator(_Section):
     soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
-    """Samples are averaged over bins of this length, which the watch follows and the fit averages over 0.25 s; by
-    default 0.04 s where wheels share a torque behind an open or limited differential.  There the lighter wheel slips
-    more, at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque: with loads that shake by 12 %, 73 to 87 % of
-    the intervals of n hold with 0.1 s, 87 to 100 % with 0.04 s (`python -m tests.lab.computed_loads`)."""
+    """Samples are averaged over bins of this length [s].  The watch follows bins, the fit averages them over 0.25 s.
+    By default 0.04 s where wheels share a torque behind an open or limited differential: there slip changes with the
+    load at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque (`python -m tests.lab.computed_loads`)."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
     """Relative difference of speeds left and right in a turn above which slip is not judged (turn gate)."""
     max_lateral: PositiveFloat = 0.3
-    """Of a vehicle that steers by skidding: lateral over longitudinal sliding speed of its wheels above which slip is
+    """Lateral over longitudinal sliding speed of the wheels of a vehicle that steers by skidding, above which slip is
     not judged; at 0.3 the shear along the wheel is 4 % less than all of it."""
     z_ref: PositiveFloat = 0.02
     """Depth of the reported bearing pressure [m]."""
     b_ref: PositiveFloat = 0.3
     """Plate width of the reported bearing pressure [m]."""
     max_bearing_std: PositiveFloat = 0.10
-    """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
-    that carries load."""
+    """Relative std of the bearing pressure up to which a window is valid; at z_ref, or the nearest depth that carries
+    load."""
     max_draft_std: PositiveFloat = 0.25
-    """Std of the largest draft up to which a window of a vehicle counts as excited, as a share of this draft's size or,
-    where that is more, of a tenth of the weight."""
+    """Std of the largest draft up to which a window of a vehicle is valid, as a share of this draft, or of a tenth of
+    the weight where that is more."""
     max_tan_phi_std: PositiveFloat = 0.15
-    """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
-    of a test rig counts as excited, and up to which a window shows the soil's strength to the warning."""
+    """Relative std of tan phi, or of the strength c + p tan phi at the contact's pressure p, up to which a window of a
+    test rig is valid, and up to which the warning uses the soil's strength."""
     max_prediction_error: PositiveFloat = 0.25
-    """Error of the torque or pull that the model predicts for data it has not seen, as a share of what is there, above
-    which a window is `model_mismatch`."""
+    """Error of the torque or pull that the model predicts for unseen data, as a share of them, above which a window is
+    `model_mismatch`."""
     max_gain_error: PositiveFloat = 6.0
-    """Gain error of a sensor, in sd of what is configured of it, above which a window is `model_mismatch`: sound
-    multibody drives end at 5.3, those with a wrong weight or draft reach 9 to 20."""
+    """Gain error of a sensor, in sd of its configured gain, above which a window is `model_mismatch`: sound multibody
+    drives end at 5.3, those with a wrong weight or draft reach 9 to 20."""
     search_rate: NonNegativeFloat = 4.0
-    """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
-    the model describes take 1 to 3 in all (field and simulated drives)."""
+    """Evaluations of the model on a whole window that a search for another soil may take in each window.  Windows that
+    the model describes take 1 to 3 in all."""
     search_burst: PositiveFloat = 100.0
-    """Most of these that are kept for later: three times what searches at nine of ten starts and borders take (34)."""
+    """Evaluations that are kept for later at most: three times what nine of ten searches at starts and borders take."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:
@@ -764,21 +754,20 @@ class Traversability(_Section):
     hold: PositiveInt = 2
     """Windows in a row that must speak for a better state."""
     max_age: PositiveFloat = 3.0
-    """Seconds after the last instant that it rests on from which a posterior no longer supports go."""
+    """Age [s] of its last instant from which a posterior no longer supports go."""
     min_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.15
     """Share of a window that must be measured on the present ground: since it changed, since a wheel last spun."""
     spin_time: PositiveFloat = 0.4
-    """Seconds for which a wheel beyond max_slip, or thrust that moves nothing, ends go: with means over 0.3 s and a
-    look every 0.1 s, within one second."""
+    """Time [s] for which a wheel beyond max_slip, or thrust that moves nothing, ends go."""
     stuck_time: PositiveFloat = 1.2
-    """Seconds for which a vehicle makes no way under thrust from which it is stuck; no start takes as long to show."""
+    """Time [s] without way under thrust from which a vehicle is stuck; no start takes as long to show."""
     standstill: PositiveFloat = 0.05
     """Rim speed [m/s] below which a wheel does not turn: two impulses a second of a ring of 100 teeth at 0.5 m."""
     stall_resistance: PositiveFloat = 0.15
     """Thrust beyond draft, slope and inertia, as a share of the weight, from which a vehicle whose wheels do not turn
-    stalls: more than an idling drive gives, less than wheels of any size need on loam (0.2 by this model)."""
+    stalls: more than an idling drive gives, less than wheels need on loam (0.2)."""
     contradiction: PositiveFloat = 3.0
-    """Standard deviations by which the wheels must pull less at their present slip than predicted for it to count."""
+    """Standard deviations by which wheels that pull less than predicted at their slip contradict the estimate."""
     full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """Share of its torque limit from which a motor gives all it can: ripple and gain error of a torque sensor."""
 
@@ -792,18 +781,18 @@ class Traversability(_Section):
 class Warning(_Section):
     """When soilbus warns of immobilisation from slip and speed alone, without any estimate of the soil.
 
-    Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
-    thesis, 2023, ch. 7), with eleven others looked at: `python -m tests.lab.snow`.
+    Tuned on six measured immobilisations of a 90 kg rover on snow (A. Lines, PhD thesis, 2023, ch. 7), with eleven
+    others looked at: `python -m tests.lab.snow`.
     """
 
     slip_horizon: PositiveFloat = 1.0
-    """Slip that is to pass `traversability.max_slip` within this time [s] is a cause."""
+    """Slip that is to pass `traversability.max_slip` within this time [s] warns."""
     stop_horizon: PositiveFloat = 1.5
-    """A vehicle that is to stand within this time [s], while thrust holds and wheels slip, is a cause."""
+    """A vehicle that is to stand within this time [s], while thrust holds and wheels slip, warns."""
     steady_horizon: PositiveFloat = 3.0
-    """The same by the steady trend of its speed."""
+    """The same time [s] by the steady trend of its speed."""
     probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.7
-    """Of either, from which it counts."""
+    """Probability of either from which it warns."""
     least_slip: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.25
     """Slip below which a vehicle that loses speed is only slowed down."""
     least_thrust: NonNegativeFloat = 0.03
@@ -872,9 +861,9 @@ class Output(_Section):
     dbc: str = "soilbus.dbc"
     """Layout of our own frames."""
     compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(default=(5.0e4, 1.0e5, 2.0e5), strict=False)
-    """Bearing pressures [Pa] from which the soil counts as slightly compacted, compacted, very compacted: codes 2, 3, 4
-    of DDI 470 in `replay --isoxml`.  A tyre presses on soft ground about as hard as it is inflated (Wong 2008, ch. 2):
-    from 0.5, 1, 2 bar on the ground carries a tyre of that pressure with a rut of at most `estimator.z_ref`."""
+    """Bearing pressures [Pa] from which soil is slightly compacted, compacted, very compacted: codes 2, 3, 4 of DDI 470
+    in `replay --isoxml`.  Such ground carries a tyre inflated to 0.5, 1, 2 bar with a rut of at most `estimator.z_ref`
+    (Wong 2008, ch. 2)."""
 
     @field_validator("compaction")
     @classmethod
@@ -887,7 +876,7 @@ class Output(_Section):
 class J1939(_Section):
     """Our source address and NAME (SAE J1939-81, ISO 11783-5); the claim concerns `soilbus run` only.
 
-    Without the claim frames carry the address of the DBC.  With it nothing is sent before the address is claimed, nor
+    Without a claim frames carry the address of the DBC.  With one nothing is sent before the address is claimed, nor
     after a node with a smaller NAME has taken it.
     """
 
