@@ -46,14 +46,14 @@ def configuration_page() -> str:
     """Every key of the TOML file with type, default and meaning, section by section."""
     text = (
         f"{GENERATED}# Configuration reference\n\nOne TOML file describes one vehicle. Values are SI; an unknown key"
-        " is an error. `soilbus check --config F` prints every setting in force. Any key can be overridden on the"
-        " command line by `--set KEY=VALUE` with its dotted path.\n"
+        " is an error. `soilbus check --config F --settings` prints every setting in force. `--set KEY=VALUE`"
+        " overrides a key by its dotted path.\n"
     )
     for heading, section in (*_sections(Config, ""), *((value.__name__, value) for value in (RunningGear, *VALUES))):
         own = inspect.get_annotations(section)
         rows = [_row(section, name, field) for name, field in section.model_fields.items() if name in own]
         text += f"\n## {heading}\n\n{inspect.getdoc(section)}\n\n| key | type | default | meaning |\n"
-        text += "| --- | --- | --- | --- |\n" + "".join(rows)
+        text += "| - | - | - | - |\n" + "".join(rows)
     return text
 
 
@@ -106,7 +106,7 @@ def _type(annotation: Any) -> str:
 
 def _value(default: Any) -> str:
     if default is None:
-        return "none"
+        return ""
     if isinstance(default, BaseModel):
         kept = {k: v for k, v in default.model_dump().items() if v not in (0.0, None)}
         return "`{ " + ", ".join(f"{k} = {_toml(v)}" for k, v in kept.items()) + " }`" if kept else "`{}`"
@@ -168,7 +168,7 @@ def _arguments(command: argparse.ArgumentParser) -> str:
         metavar = action.metavar if isinstance(action.metavar, str) else " ".join(action.metavar or ())
         shown = f"{', '.join(action.option_strings)} {metavar}".strip() or action.dest
         rows.append(f"| `{shown}`{' (required)' if action.required else ''} | {action.help or ''} |\n")
-    return taken + ("| argument | meaning |\n| --- | --- |\n" + "".join(rows) if rows else "")
+    return taken + ("| argument | meaning |\n| - | - |\n" + "".join(rows) if rows else "")
 
 
 def effects_page() -> str:
@@ -188,7 +188,7 @@ def _effect(effect: Effect) -> str:
     rows = ([", ".join(names), *others] for (_, *others), names in alike.items())
     return (
         f"\n## {effect.name}\n\n{effect.physics}\n\n*Shown by:* {effect.tells}\n\n*Source:* {effect.source}\n\n"
-        + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["---"] * len(HEAD), *rows))
+        + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["-"] * len(HEAD), *rows))
     )
 
 

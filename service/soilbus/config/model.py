@@ -173,7 +173,7 @@ class Dbc(_Section):
     input: list[str] = Field(default_factory=list)
     """Files that hold the mapped messages."""
     checked: list[str] = Field(default_factory=list)
-    """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
+    """Messages of the vehicle's own DBC that count only with a right Counter and Checksum (dbc/README.md)."""
 
 
 class Signal(_Section):
@@ -192,16 +192,15 @@ class Signal(_Section):
     timeout: PositiveFloat | None = None
     """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
-    """How much earlier what a sample reports was true [s]: a radar's filter, a receiver's solution, a queue."""
+    """Time [s] by which a sample is late: a radar's filter, a receiver's solution, a queue."""
     torque_constant: PositiveFloat | None = None
     """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
     reference_torque: PositiveFloat | None = None
-    """Torque of 100 % [N m], where a percentage of it is mapped: in J1939 SPN 513, of the engine's reference torque,
-    SPN 544."""
+    """Torque of 100 % [N m], where a percentage is mapped: in J1939 SPN 544, of which SPN 513 is the percentage."""
     effective_area: Annotated[PositiveFloat, AfterValidator(SPRING_AREA)] | None = None
-    """Of an axle's air springs together [m^2], where their pressure is mapped to its load: force over pressure."""
+    """Force over pressure of an axle's air springs together [m^2], where their pressure is mapped to its load."""
     unsprung_mass: NonNegativeFloat = 0.0
-    """What the air springs do not carry [kg]: axle and wheels; added to the load that their pressure gives."""
+    """Mass that the air springs do not carry [kg]: axle and wheels."""
     unit: str | None = None
     """Unit of a column's values, where its name does not end in one."""
 
@@ -231,15 +230,15 @@ class Vehicle(_Section):
     mass: Annotated[PositiveFloat, AfterValidator(MASS)]
     """Of the whole vehicle [kg], ballast included; `{ value, std }` where tanks, driver or load change it."""
     mass_std: Annotated[NonNegativeFloat, AfterValidator(MASS_STD)] | None = None
-    """Its standard deviation [kg], which `mass = { value, std }` sets; by default 2 % of the mass where a load is not
-    measured (driver, half a tank), else 0."""
+    """Its std [kg], which `mass = { value, std }` sets; by default 2 % of the mass (driver, half a tank) where a load
+    is not measured, else 0."""
     wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
     """First to last axle [m]."""
     cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
     """Centre of gravity ahead of the rear axle [m]; `{ value, std }` where it is not known well."""
     cg_std: Annotated[NonNegativeFloat, AfterValidator(LENGTH_STD)] | None = None
-    """Its standard deviation [m], which `cg_ahead_of_rear_axle = { value, std }` sets; by default 2 % of the wheelbase
-    where a load is not measured, else 0."""
+    """Its std [m], which `cg_ahead_of_rear_axle = { value, std }` sets; by default 2 % of the wheelbase where a load is
+    not measured, else 0."""
     cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
     """Centre of gravity above the ground [m]."""
     hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
@@ -302,8 +301,8 @@ class Axle(_Section):
     ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(WHEELBASE)] | None = None
     """Distance [m] of an axle between the first and the last from the last; without, all are equally far apart."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
-    """Turns of the shaft for one of the axle's wheels; of `both`: of its motor for one of the shafts to the axles,
-    whose own ratios are those of `front` and `rear`."""
+    """Turns of the motor for one of the axle's wheels; of `both`: for one of the shafts to the axles, whose own ratios
+    are those of `front` and `rear`."""
     differential: Literal["open", "locked", "limited"] = "open"
     """Open: the same torque left and right.  Locked: the same speed.  Limited: in between."""
     torque_bias: Annotated[NonNegativeFloat, AfterValidator(SHARE)] | None = None
@@ -758,18 +757,19 @@ class Traversability(_Section):
     min_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.15
     """Share of a window that must be measured on the present ground: since it changed, since a wheel last spun."""
     spin_time: PositiveFloat = 0.4
-    """Time [s] for which a wheel beyond max_slip, or thrust that moves nothing, ends go."""
+    """Time [s] for which a wheel beyond max_slip, or thrust that moves nothing, ends go: by means over 0.3 s within one
+    second."""
     stuck_time: PositiveFloat = 1.2
     """Time [s] without way under thrust from which a vehicle is stuck; no start takes as long to show."""
     standstill: PositiveFloat = 0.05
-    """Rim speed [m/s] below which a wheel does not turn: two impulses a second of a ring of 100 teeth at 0.5 m."""
+    """Rim speed [m/s] below which a wheel does not turn: two impulses a second of 100 teeth at 0.5 m."""
     stall_resistance: PositiveFloat = 0.15
     """Thrust beyond draft, slope and inertia, as a share of the weight, from which a vehicle whose wheels do not turn
     stalls: more than an idling drive gives, less than wheels need on loam (0.2)."""
     contradiction: PositiveFloat = 3.0
     """Standard deviations by which wheels that pull less than predicted at their slip contradict the estimate."""
     full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
-    """Share of its torque limit from which a motor gives all it can: ripple and gain error of a torque sensor."""
+    """Share of its torque limit from which a motor gives all it can: ripple and gain error of its sensor."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Traversability:
@@ -842,7 +842,7 @@ class Form(_Section):
     exit: NonNegativeFloat = 0.17
     """How large the exit angle behind the axle may be, over the entry angle: a rut that springs back by 3 %."""
     shear: NonNegativeFloat = 1.0
-    """Share of the strength that the other shear law may mobilise: all of it or none, one as likely as the other."""
+    """Share of the strength that the other shear law may mobilise: all of it or none, equally likely."""
 
 
 class Model(_Section):
