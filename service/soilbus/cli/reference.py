@@ -34,7 +34,7 @@ GENERATED = "<!-- generated: python -m soilbus.cli.reference service/docs -->\n\
 
 
 def pages() -> dict[str, str]:
-    """Text of each generated page by its file name."""
+    """Return the text of each generated page by its file name."""
     return {
         "configuration.md": configuration_page(),
         "commands.md": commands_page(),
@@ -43,7 +43,7 @@ def pages() -> dict[str, str]:
 
 
 def configuration_page() -> str:
-    """Every key of the TOML file with type, default and meaning, section by section."""
+    """Return every key of the TOML file with type, default and meaning, section by section."""
     text = (
         f"{GENERATED}# Configuration reference\n\nOne TOML file describes one vehicle. Values are SI; an unknown key"
         " is an error. `soilbus check --config F --settings` prints every setting in force. `--set KEY=VALUE`"
@@ -135,7 +135,7 @@ def _attribute_docs(section: type[BaseModel]) -> dict[str, str]:
 
 
 def commands_page() -> str:
-    """The help of every command."""
+    """Return the help of every command."""
     text = (
         f"{GENERATED}# Commands\n\nExit codes: 0 done; 1 the work could not be done (one line on stderr); 2 wrong usage"
         " or configuration. An output file is there whole or not at all; workers end with the command.\n\n"
@@ -172,7 +172,7 @@ def _arguments(command: argparse.ArgumentParser) -> str:
 
 
 def effects_page() -> str:
-    """The catalogue of effects: physics, parameters with unit, neutral value and range, source, what shows it."""
+    """Return the catalogue of effects: physics, parameters with unit and range, source, what shows it."""
     text = (
         f"{GENERATED}# Effects\n\nWhat can be added to the wheel–soil model, to the balance of the vehicle or to a"
         " sensor: by `soilbus diagnose`, by `[model] effects` of a configuration, or by `soilbus simulate --effect"

@@ -79,7 +79,7 @@ SignalName = Annotated[str, Field(min_length=1), AfterValidator(_signal_name)]
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; `faults` holds one line for each fault, without line breaks of names."""
+    """Error of a configuration that cannot be used; `faults` holds one line for each fault."""
 
     def __init__(self, faults: Iterable[str]) -> None:
         self.faults = [shown(fault) for fault in faults]
@@ -88,7 +88,7 @@ class ConfigError(Exception):
 
 @dataclass(frozen=True)
 class Usual:
-    """From the least to the greatest value that a real machine has; what lies outside is a slip of the pen.
+    """Range of values that real machines have; a value outside is a slip of the pen.
 
     `slips` are units in which the quantity is often written by mistake, with their SI value:
     the one that makes the most ordinary value of it is named.
@@ -364,12 +364,12 @@ class Wheel(RunningGear):
 
     @property
     def contact_length(self) -> float:
-        """Of a track on the ground [m]; 0 of a wheel."""
+        """Contact length of a track on the ground [m]; 0 of a wheel."""
         return self._contact_length
 
     @property
     def section(self) -> str:
-        """Of the TOML file that describes it."""
+        """Section of the TOML file that describes it."""
         return "track" if self._contact_length else "wheel"
 
     @model_validator(mode="after")
@@ -412,7 +412,7 @@ class Track(RunningGear):
     1963).  Without, pressure is uniform."""
 
     def as_wheel(self) -> Wheel:
-        """The rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
+        """Return the rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
         same = {key: getattr(self, key) for key in type(self).model_fields if key in Wheel.model_fields}
         wheel = Wheel(**same | {"axle": self.axle or "front"}, radius=self.radius, tyre="rigid")
         wheel._contact_length = self.contact_length
@@ -611,7 +611,7 @@ class NoiseOfChannels(_Section):
         return noise
 
     def scaled(self, factor: float, *parts: str) -> NoiseOfChannels:
-        """With these parts (by default all) of each channel's noise times a factor, which may be 0."""
+        """Return the noise with these parts (by default all) of each channel times a factor, which may be 0."""
         noises = {name: getattr(self, name) for name in type(self).model_fields}
         return self.model_copy(update={
             name: noise.model_copy(update={part: factor * getattr(noise, part) for part in parts or Noise.model_fields})
@@ -1097,11 +1097,11 @@ class Config(_Section):
         return self
 
     def axle_named(self, name: str | None) -> Axle | None:
-        """The [[axle]] of this name; None without."""
+        """Return the [[axle]] of this name; None without."""
         return next((axle for axle in self.axle if axle.name == name), None)
 
     def same_signal(self, role: str) -> list[list[Wheel]]:
-        """The wheels that have a role (torque, speed, load), those on one and the same signal together."""
+        """Return the wheels that have a role (torque, speed, load), those on the same signal together."""
         mapped = [wheel for wheel in self.wheel if getattr(wheel, role) is not None]
         return list(grouped(mapped, lambda wheel: getattr(wheel, role).signal).values())
 

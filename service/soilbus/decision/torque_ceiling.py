@@ -50,7 +50,7 @@ class TorqueCeiling:
 
     @classmethod
     def unknown(cls, wheels: int) -> TorqueCeiling:
-        """The state before any measurement."""
+        """Return the state before any measurement."""
         no = np.zeros(wheels, bool)
         return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), np.zeros(wheels), no, no, no)
 
@@ -60,7 +60,7 @@ class TorqueCeiling:
         return np.where((self.lasts & self.unmet) | self.returned, self.level, np.nan)
 
     def after(self, window: Window, rig: Rig, span: float, deviations: float) -> TorqueCeiling:
-        """The state after the spans of a window that come after the last one.
+        """Return the ceiling after one more window, of which only new spans count.
 
         Parameters
         ----------

@@ -49,7 +49,7 @@ SLOPE_WANDER = 0.03
 
 
 class Alert(StrEnum):
-    """Is the vehicle about to get stuck?"""
+    """Warning of immobilisation."""
 
     UNKNOWN = "unknown"
     NONE = "none"
@@ -57,7 +57,7 @@ class Alert(StrEnum):
 
 
 class Stall(NamedTuple):
-    """What slip and speed alone say of a stall ahead; `stalling` makes the next one.
+    """Signs of a stall in slip and speed alone; `stalling` makes the next one.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def stalling(
     before: Stall, sample: Sample, min_speed: float, settings: Settings, limits: Traversability,
     options: WatchOptions = WATCH,
 ) -> Stall:  # fmt: skip
-    """Return what slip and speed say after one more sample; samples in their order, at any rate.
+    """Return the signs of a stall after one more sample; samples in their order, at any rate.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _time_to(trend: LocalTrend, level: float) -> float:
 
 
 class Margin(NamedTuple):
-    """What the curve leaves of the ground's capacity; `left_by` makes the next one.
+    """Share of the ground's capacity that is left, by the curve of pull over slip; `left_by` makes the next one.
 
     Attributes
     ----------
@@ -238,7 +238,7 @@ def left_by(
     before: Margin, row: tuple[float, float, float, float], curve: OverSlip | None, max_slip: float,
     options: WatchOptions = WATCH,
 ) -> Margin:  # fmt: skip
-    """Return what is left of the capacity after one more row of `Margin.rows`, as a curve has it."""
+    """Return the margin after one more row of `Margin.rows`, by a curve of pull over slip."""
     t, slip, *_ = row
     last = float(before.rows[-1, 0]) if len(before.rows) else -math.inf
     if not 0.0 < t - last <= LONGEST_GAP:
@@ -467,7 +467,7 @@ def seen_at(watch: Watch, now: float, config: Config, options: WatchOptions = WA
 
 
 def ended(watch: Watch, config: Config) -> Watch:
-    """Return the watch after a decision is go: a warning without a cause is over."""
+    """Return the watch once a decision is go: a warning without a cause ends."""
     return seen_at(watch._replace(caused=-math.inf), watch.t, config)
 
 
@@ -525,7 +525,7 @@ def _others_grip(moment: Moment, spins: Sequence[bool]) -> bool:
 
 
 class Warnings(NamedTuple):
-    """When warnings began [s]: the present one (None without), and those since the last window, ended or not."""
+    """Times [s] at which warnings began: the present one (None without), and those since the last window."""
 
     since: float | None = None
     begun: tuple[float, ...] = ()

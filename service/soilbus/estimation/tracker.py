@@ -203,7 +203,7 @@ class Tracker:
 
     @property
     def instant(self) -> float:
-        """Length [s] of an instant; 0, bins as they are, on tracks alone: no tyre relaxes or bounces."""
+        """Length [s] of an instant; 0 (bins as they are) on tracks, where no tyre relaxes or bounces."""
         lengths = self.rig.lengths
         return 0.0 if lengths is not None and (lengths > 0.0).all() else self.settings.instant
 
@@ -222,7 +222,7 @@ class Tracker:
         self._last_run = gaussian, elapsed
 
     def start_from(self, other: Tracker, t: float) -> None:
-        """Take the soil that another tracker knows as prior from `t` [s] on: the machine changed, not the ground."""
+        """Take the soil that another tracker knows as prior from `t` [s] on, as when the machine changes."""
         known = other.newest_posterior
         if known is None:
             return
@@ -245,7 +245,7 @@ class Tracker:
 
     @property
     def components(self) -> VarianceComponents:
-        """What each kind of sensor is worth, by the windows so far."""
+        """Variance components of the sensors, learned from the windows so far."""
         return self._components
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
@@ -478,7 +478,7 @@ class Tracker:
         return fit
 
     def mismatch(self, fit: Fit | None) -> bool:
-        """Whether a fit failed, or fits much worse than the windows before: its data may be of several soils."""
+        """Return whether a fit failed, or fits much worse than the windows before, as on several soils."""
         return fit is None or not fit.converged or self.is_of_several_soils(fit)
 
     def is_of_several_soils(self, fit: Fit) -> bool:
@@ -562,12 +562,12 @@ class Tracker:
 
 
 def new_soil_prior(prior: SoilPrior) -> SoilPrior:
-    """Prior of a new soil: log sd at least the spread of the soils in `terra.soils`; held parameters stay held."""
+    """Return the prior of a new soil, at least as wide as the soils in `terra.soils`; held parameters stay."""
     soils = np.log(list(SOILS.values()))
     return SoilPrior(prior.median, np.where(prior.log_std > 0.0, np.maximum(prior.log_std, soils.std(0)), 0.0))
 
 
 def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list[str], Array]:
-    """Names and prior sd (G,) of a vehicle's nuisance parameters: sensor gains, then effect parameters."""
+    """Return names and prior sd (G,) of the nuisance parameters: sensor gains, then effect parameters."""
     problem = ObservationModelWithEffects(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
     return problem.gain_names, problem.gain_std
