@@ -41,7 +41,7 @@ _LIMITS = np.iinfo(np.int64)
 
 
 class SignalColumn(NamedTuple):
-    """One signal of N frames.
+    """Values of one signal in N frames.
 
     `raw` (N,): codes, int64 (uint64 for 64 unsigned bits, float64 for float signals).
     `physical` (N,): scaled value as cantools gives it, int64, uint64, float64, or objects where

@@ -55,7 +55,7 @@ class Batch:
 
 @dataclass(slots=True)
 class Inbox:
-    """One message: its frames not yet taken, and what must be remembered between batches."""
+    """Inbox of one message: frames not yet taken, and what is remembered between batches."""
 
     message: Message
     channels: tuple[Channel, ...]

@@ -9,7 +9,7 @@ LATE = 0.1
 
 
 class Outbox:
-    """One slot for each identifier.  A newer frame takes the place of the one that waits, and its turn."""
+    """Queue of frames to send, with one slot for each identifier: a newer frame takes it over, and its turn."""
 
     def __init__(self) -> None:
         self.dropped = 0

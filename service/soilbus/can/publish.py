@@ -26,7 +26,7 @@ _BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame, ready to send."""
+    """Frame that is ready to send."""
 
     arbitration_id: int
     extended: bool

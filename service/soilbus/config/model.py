@@ -151,7 +151,7 @@ class _Section(BaseModel):
 
 
 class Bus(BaseModel):
-    """Handed to python-can; keys that are not ours go to the interface as they are."""
+    """Interface of python-can; keys that are not ours go to it as they are."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     interface: str = "socketcan"
@@ -177,7 +177,7 @@ class Dbc(_Section):
 
 
 class Signal(_Section):
-    """Where a role's value comes from: "Message.Signal", or a table with more to say."""
+    """Source of a role's value: "Message.Signal", or a table with more keys."""
 
     signal: SignalName
     """`Message.Signal` of the DBC; with [columns] the name of a column."""
@@ -289,7 +289,7 @@ class SignalOfAcceleration(Signal):
 
 
 class Axle(_Section):
-    """What belongs to an axle and not to a wheel: its motor, its differential, a load cell or air spring.
+    """Motor, differential, load cell or air spring of an axle.
 
     Axles stand in the order of their tables, from the front to the rear; `front` is always the first and `rear` the
     last.  `both` is the shaft that drives all axles; its differentials are those between the axles.  Torques are of the
@@ -620,7 +620,7 @@ class NoiseOfChannels(_Section):
 
 
 class Prior(_Section):
-    """What is known of a soil parameter beforehand; std = 0 holds it at value."""
+    """Prior of a soil parameter; std = 0 holds it at value."""
 
     value: NonNegativeFloat
     """Median of the prior."""
@@ -736,7 +736,7 @@ class Estimator(_Section):
 
 
 class Traversability(_Section):
-    """When soilbus says go; draft N, slopes rad."""
+    """Thresholds of go and no_go; draft N, slopes rad."""
 
     max_slip: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.6
     """Slip that no driven wheel may pass; the largest draft is sought up to it."""
@@ -779,7 +779,7 @@ class Traversability(_Section):
 
 
 class Warning(_Section):
-    """When soilbus warns of immobilisation from slip and speed alone, without any estimate of the soil.
+    """Warning of immobilisation from slip and speed alone, without any estimate of the soil.
 
     Tuned on six measured immobilisations of a 90 kg rover on snow (A. Lines, PhD thesis, 2023, ch. 7), with eleven
     others looked at: `python -m tests.lab.snow`.
@@ -828,7 +828,7 @@ class Effect(BaseModel):
 
 
 class Form(_Section):
-    """How far the contact of wheel and soil may differ in form from the model, at most; 0: not at all.
+    """Largest difference in form between the contact of wheel and soil and the model; 0: none.
 
     The greatest stress sits at (c1 + c2 s) of the entry angle, where the model has 0.5: c1 is 0.18 in loose and
     0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81).  Every form from the model's to
@@ -856,7 +856,7 @@ class Model(_Section):
 
 
 class Output(_Section):
-    """What soilbus sends."""
+    """Layout of our frames, and classes of the soil map."""
 
     dbc: str = "soilbus.dbc"
     """Layout of our own frames."""

@@ -80,7 +80,7 @@ class Axles:
 
     @property
     def drives(self) -> NDArray[np.bool_]:
-        """(W,), which wheels are driven."""
+        """Which wheels are driven (W,)."""
         return np.asarray(self.driven[self.of_wheel, 0])
 
     @classmethod

@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class MeasurementOptions:
-    """Which instants of a window are usable, and how their forces are computed."""
+    """Tuning values: which instants of a window are usable, and how their forces are computed."""
 
     load_tolerance: float = 0.02
     """Relative error of load [1] accepted in the first entry angles; each linearisation reduces it further."""
@@ -209,7 +209,7 @@ HELD = StandingOptions(0.0, 0.0, StandingOptions().wheel_mass_share, 0.0, 0.0, 0
 
 @dataclass(frozen=True, slots=True)
 class VarianceOptions:
-    """How variance components are learned from residuals (`variance_components`)."""
+    """Tuning values: how variance components are learned from residuals (`variance_components`)."""
 
     block: float = 1.0
     """Length of a block [s]: an axle bounces at 1.5 to 3 Hz, so that a second holds whole cycles of it."""

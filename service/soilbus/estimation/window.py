@@ -120,7 +120,7 @@ class Rig:
 
     @property
     def front(self) -> NDArray[np.bool_]:
-        """(W,), which wheels are on the front axle."""
+        """Which wheels are on the front axle (W,)."""
         return np.asarray(self.ahead == 1.0)
 
     @property
@@ -130,7 +130,7 @@ class Rig:
 
     @property
     def drives(self) -> NDArray[np.bool_]:
-        """(W,), which wheels a motor can drive."""
+        """Which wheels a motor can drive (W,)."""
         return np.ones(len(self.wheels), bool) if self.driven is None else self.driven
 
 
