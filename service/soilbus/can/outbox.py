@@ -9,7 +9,7 @@ LATE = 0.1
 
 
 class Outbox:
-    """Queue of frames to send, with one slot for each identifier: a newer frame takes it over, and its turn."""
+    """Queue of frames to send, a slot for each identifier: a newer frame replaces the one that waits, in its turn."""
 
     def __init__(self) -> None:
         self.dropped = 0

@@ -11,7 +11,7 @@
     slips          s > 0.7 s_max
 
 P: pull given, P_hat: pull over slip of the last window (Kalman filter and regressions with exponential forgetting).
-The first three and `creeps` need no soil: a local linear trend follows q, V and sinkage, and how much slip shakes widens
+The first three and `creeps` need no soil: a local linear trend follows q, V and sinkage, and slip that shakes widens
 it.  The others need the curve and some seconds of moments.  The moments are kept and seen along the newest curve: so a
 new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.
 
