@@ -34,9 +34,9 @@ def test_every_key_and_effect_has_its_row() -> None:
         row = next(line for line in configuration.splitlines() if line.startswith(f"| `{key}` "))
         assert not row.endswith("|  |"), f"{key} has no meaning"
     for effect in CATALOGUE.values():
-        assert f"## {effect.name}\n" in effects
-        for parameter in effect.parameters:
-            assert f"| `{parameter.name}` |" in effects
+        (section,) = re.findall(rf"^## {effect.name}\n(.*?)(?=^## |\Z)", effects, re.MULTILINE | re.DOTALL)
+        named = re.findall(r"`(\w+)`", "".join(re.findall(r"^\|([^|]*)\|", section, re.MULTILINE)))
+        assert named == [parameter.name for parameter in effect.parameters]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))

@@ -15,7 +15,7 @@ import os
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 """Version of this package: the one place where it stands, which the build, `soilbus --version` and the bus read."""
 
 _MODULES = {

@@ -7,7 +7,7 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # while all else is loaded there i
 
 
 def program() -> NoReturn:
-    """The command line as a process."""
+    """Run the command line as a process."""
     from soilbus.process import hold_standard_streams, run_and_leave
 
     hold_standard_streams()

@@ -31,7 +31,7 @@ from soilbus.words import shown
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a file may ask of the machine that reads it; the size of a log is not bounded, for it is never in memory."""
+    """Limits on what a file may ask of the machine that reads it; a log's size has none."""
 
     ratio: float = 250.0
     """Unpacked bytes for each packed byte.  A candump log of a parked machine with constant data, 400 000 lines:
@@ -52,7 +52,7 @@ LIMITS = Limits()
 
 
 def read_bounded(path: Path, largest: int, regular: bool = True) -> bytes:
-    """Content of a file of `largest` bytes at most; with `regular` of nothing but a regular file, and never waiting.
+    """Return the content of a file of `largest` bytes at most; with `regular` of a regular file only.
 
     Raises OSError with a reason that can be printed.
     """
@@ -64,7 +64,7 @@ def read_bounded(path: Path, largest: int, regular: bool = True) -> bytes:
 
 
 def read_all(file: IO[bytes], largest: int = LIMITS.whole, name: str = "") -> bytes:
-    """The rest of a file; OSError where it has more than `largest` bytes."""
+    """Return the rest of a file; OSError where it has more than `largest` bytes."""
     content = file.read(largest + 1)
     if len(content) > largest:
         raise OSError(errno.EFBIG, f"larger than {largest / 2**20:g} MiB", name)
@@ -73,7 +73,7 @@ def read_all(file: IO[bytes], largest: int = LIMITS.whole, name: str = "") -> by
 
 @contextmanager
 def opened(path: Path) -> Iterator[io.BufferedReader]:
-    """The plain bytes of a file, packed or not, as a stream; "-" is standard input.
+    """Open the plain bytes of a file, packed or not, as a stream; "-" is standard input.
 
     Packing (gzip, bzip2, xz, zstd) is recognised by its first bytes.  Raises OSError where the file cannot be read;
     reading raises ValueError where it is damaged, cut off, or more than its limits allow.
@@ -87,18 +87,18 @@ def opened(path: Path) -> Iterator[io.BufferedReader]:
 
 
 def plain_bytes(file: Any) -> io.BufferedReader:
-    """A stream of the plain bytes of an unbuffered binary file, which may be packed; as `opened`."""
+    """Return a stream of the plain bytes of an unbuffered binary file, which may be packed; as `opened`."""
     packed = _Counted(file)
     return io.BufferedReader(_Unpacked(packed), _BUFFER)
 
 
 def packing(stream: io.BufferedReader) -> str:
-    """How the file of a stream of `opened` is packed, such as "gzip"; empty where it is not."""
+    """Return how the file of a stream of `opened` is packed, such as "gzip"; empty where it is not."""
     return stream.raw.packing if isinstance(stream.raw, _Unpacked) else ""
 
 
 def text_lines(stream: io.BufferedReader) -> Iterator[str]:
-    """The lines of a text file, none of which takes more memory than `Limits.line`; ValueError for a longer one.
+    """Yield the lines of a text file; ValueError for one longer than `Limits.line`.
 
     UTF-8, or UTF-16 with its byte order mark; other bytes are of Windows' code page, as programs there write them.
     """
@@ -221,7 +221,7 @@ _NO_UNNAMED_FILES = {errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL}
 
 @contextmanager
 def placed(path: Path) -> Iterator[int]:
-    """Descriptor of a new file that gets its name when the context is left without an exception.
+    """Give a descriptor of a new file that gets its name when the context ends without an exception.
 
     What was there before is replaced then; a link stays one, and what is no regular file is written to as it is.
     Until then the file has no name where the file system can do that (O_TMPFILE, open(2)), else a hidden one.
@@ -276,7 +276,7 @@ def _name(descriptor: int, spare: Path) -> None:
 
 
 class NotWritten(Exception):
-    """A file cannot be written; the text is one line for the user."""
+    """Error of a file that cannot be written; the text is one line for the user."""
 
     def __init__(self, text: str) -> None:
         super().__init__(shown(text))
@@ -284,7 +284,7 @@ class NotWritten(Exception):
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[IO[str]]:
-    """A text file that appears under its name only when it is complete; "-" is stdout.
+    """Open a text file that appears under its name only when it is complete; "-" is stdout.
 
     Raises NotWritten where it cannot be, and then there is none.
     """
@@ -310,7 +310,7 @@ def write_text(path: Path, text: str) -> None:
 
 @contextmanager
 def whole_file_of_bytes(path: Path) -> Iterator[IO[bytes]]:
-    """A binary file that appears under its name only when it is complete.
+    """Open a binary file that appears under its name only when it is complete.
 
     Raises NotWritten where it cannot be, and then there is none.
     """

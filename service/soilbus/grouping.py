@@ -10,7 +10,7 @@ _V = TypeVar("_V")
 
 
 def grouped(items: Iterable[_V], key: Callable[[_V], _K]) -> dict[_K, list[_V]]:
-    """The items by their key; keys, and items of one key, in the order in which they come."""
+    """Return the items by their key; keys and items keep the order in which they come."""
     groups: dict[_K, list[_V]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

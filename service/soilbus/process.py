@@ -24,7 +24,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Ended(KeyboardInterrupt):
-    """A signal ends the process."""
+    """Signal that ends the process."""
 
 
 def run_and_leave(main: Callable[[], int]) -> NoReturn:
@@ -77,7 +77,7 @@ def _give_up_messages() -> None:
 
 
 def hold_standard_streams() -> None:
-    """No file that is opened later becomes a standard stream, and no character breaks what is written."""
+    """Keep later files from becoming standard streams, and let no character break what is written."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -92,7 +92,7 @@ def hold_standard_streams() -> None:
 
 
 def output_fault() -> OSError | None:
-    """Why standard output does not take what was written to it, None where it does; from then on it loses all."""
+    """Return why standard output does not take what was written, and drop all output from then on; else None."""
     try:
         sys.stdout.flush()
         os.write(1, b"")  # what is larger than the buffer is lost at once and leaves nothing to flush
@@ -103,6 +103,6 @@ def output_fault() -> OSError | None:
 
 
 def say(text: str) -> None:
-    """One line for the user, where there is still somebody to read it."""
+    """Print one line for the user, where somebody is still there to read it."""
     with suppress(OSError):
         print(f"soilbus: {shown(text)}", file=sys.stderr, flush=True)

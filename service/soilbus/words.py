@@ -13,7 +13,7 @@ LONGEST_NAME = 300
 
 
 def shown(text: object, most: int = LONGEST_LINE) -> str:
-    """The text as one line for a terminal, a page or a cell: what is not printable by its code, the middle cut out.
+    """Return a text as one line: unprintable characters by their codes, the middle of a long one cut out.
 
     Names of files, signals and vehicles may hold anything: escape sequences, line breaks, marks that turn the direction
     of writing.  Applied again it changes nothing.
@@ -33,17 +33,17 @@ def shown(text: object, most: int = LONGEST_LINE) -> str:
 
 
 def text_of(lines: Iterable[object]) -> str:
-    """Lines as `shown`, each with its end."""
+    """Return lines as `shown`, each with its end."""
     return "".join(f"{shown(line)}\n" for line in lines)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Such as "; did you mean radius?", or nothing where no known name is near; capitals do not count."""
+    """Return "; did you mean radius?" with the nearest known name, or nothing where none is near."""
     folded = {n.casefold(): n for n in known}
     close = difflib.get_close_matches(name.casefold(), folded, n=1)
     return f"; did you mean {folded[close[0]]}?" if close else ""
 
 
 def one_line(error: Exception, most: int | None = None) -> str:
-    """What the error says, without line breaks, at most `most` characters of it; its type where it says nothing."""
+    """Return what an error says in one line of at most `most` characters; its type where it says nothing."""
     return " ".join(str(error).split())[:most] or type(error).__name__

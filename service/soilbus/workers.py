@@ -70,7 +70,7 @@ class _SpawnContext(SpawnContext):
 def workers(
     count: int, method: Literal["fork", "spawn"], begin: Callable[..., None], *arguments: Any
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `count` processes, each of which calls `begin` first.
+    """Give a pool of `count` processes, each of which calls `begin` first.
 
     They are killed when this process dies, and when the thread that starts them ends.  Left by an exception, the
     context waits for none of them.

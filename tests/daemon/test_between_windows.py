@@ -137,7 +137,7 @@ def test_frames_and_lines_judge_a_corrected_draft_alike(tmp_path):
 
 
 def test_bins_that_leave_too_few_values_are_said_to():
-    config = reference_configuration(["estimator.bin=0.5"], REFERENCES["tractor-2wd"])
+    config = reference_configuration(["estimator.bin=0.5", "estimator.window=3.0"], REFERENCES["tractor-2wd"])
     result = decided(config, simulate(config, excited("loam", 10.5), seed=3))
     assert (result.status, result.reason) == (Status.NOT_EXCITED, "not_excited few_bins")
     assert result.posterior is None

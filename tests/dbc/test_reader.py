@@ -260,5 +260,5 @@ def test_the_reader_shows_the_verdict_by_the_rules(read):
     log = (DBC / "sample.log").read_text()
     frames = [(m.timestamp, Frame(m.arbitration_id, True, bytes(m.data))) for m in can.CanutilsLogReader(StringIO(log))]
     shown = [line.verdict for line in read(frames) if line.message == "verdict"]
-    assert shown[:3] == ["go", "caution", "go"]
+    assert shown[:3] == ["caution", "go", "caution"]
     assert "no_go" in shown

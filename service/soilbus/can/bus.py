@@ -52,7 +52,7 @@ class BusError(Exception):
 
 
 def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
-    """The bus that the section [bus] describes, with kernel filters where it has a kernel.
+    """Return the bus that the section [bus] describes, with kernel filters where it has a kernel.
 
     Raises BusError with one line.
     """
@@ -65,7 +65,7 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
 
 
 def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
-    """One line on the bus that the section [bus] describes, of what its driver raised."""
+    """Return one line that says what the driver of the bus of [bus] raised."""
     name = f"{settings.get('interface')}:{settings.get('channel')}"
     number = getattr(error, "errno", None) or getattr(error, "error_code", None)
     if number in _KERNEL_WITHOUT_CAN:
@@ -77,7 +77,7 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
 
 
 def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[float, int, bool, bytes, bool, bool]]:
-    """Frames that the bus carries from now on, as `candump.Frame`; nothing is sent.
+    """Yield the frames that the bus carries from now on, as `candump.Frame`; nothing is sent.
 
     Raises BusError for a bus that cannot be opened or goes away.
     """
@@ -125,7 +125,7 @@ def ask_for_buffer(own: socket.socket) -> None:
 
 @dataclass(slots=True)
 class BusCounts:
-    """What happened on the bus since the start; dropped frames are ours, overruns the others'."""
+    """Counts of the bus since the start; dropped frames are ours, overruns the others'."""
 
     received: int = 0
     sent: int = 0
@@ -185,14 +185,14 @@ class LiveBus:
 
     @property
     def counts(self) -> BusCounts:
-        """What happened so far."""
+        """Counts of the bus since the start."""
         counts = self._counts
         counts.dropped = self._outbox.dropped + self._refused_while_away
         counts.overruns = self._overruns_before + (self._wire.overruns if self._wire is not None else 0)
         return counts
 
     def open(self) -> None:
-        """Open now; raises BusError."""
+        """Open the bus now; raise BusError where that fails."""
         bus = self._opener()
         try:
             self._wire = wire_of(bus)
@@ -230,7 +230,7 @@ class LiveBus:
         self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
 
     def receive(self, timeout: float) -> Received | can.Message | None:
-        """The next frame for us; None after `timeout` [s], when the bus is away, or for a frame that is not for us.
+        """Return the next frame for us; None after `timeout` [s], or where the bus is away.
 
         Whatever a driver raises that tells of no failure of the bus is one frame that it could not read.
         """
@@ -269,11 +269,11 @@ class LiveBus:
         return message
 
     def stamping_time(self) -> float:
-        """The present time [s] by the clock that stamps frames; nan where that is not known."""
+        """Return the present time [s] by the clock that stamps frames; nan where that is not known."""
         return math.nan if self._wire is None else self._wire.stamping_time()
 
     def heard_until(self) -> float:
-        """Stamp [s] before which no frame can come any more; -inf where that is not known."""
+        """Return the stamp [s] before which no frame can come any more; -inf where that is not known."""
         return -math.inf if self._wire is None else self._wire.heard_until()
 
     def _note_error(self, message: Received | can.Message) -> None:
@@ -301,7 +301,7 @@ class LiveBus:
         self._say(f"another node sends our frame {message.arbitration_id:08X}")
 
     def send(self, frame: Frame) -> bool:
-        """Send, or keep for a moment if there is no room; whether nothing waits any more.
+        """Send a frame, or keep it for a moment if there is no room; return whether nothing waits any more.
 
         A frame is dropped when a newer one of its identifier comes before there is room, when
         it is late, or when the bus is away.
@@ -336,7 +336,7 @@ class LiveBus:
             log.warning("%s", text)
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the bus."""
         wire, self._wire = self._wire, None
         self._outbox.clear()
         if wire is not None:

@@ -22,7 +22,7 @@ class BusState(StrEnum):
 
 
 def state_told(before: BusState, error_class: int, data: bytes | bytearray) -> BusState:
-    """State after an error frame with this identifier (without flags) and data; `before` if it says nothing of it."""
+    """Return the state after an error frame with this identifier and data; `before` if it tells none."""
     if error_class & _BUS_OFF:
         return BusState.OFF
     if error_class & _RESTARTED:
@@ -35,5 +35,5 @@ def state_told(before: BusState, error_class: int, data: bytes | bytearray) -> B
 
 
 def tells_overflow(error_class: int, data: bytes | bytearray) -> bool:
-    """Whether the controller lost a frame because nobody fetched it in time."""
+    """Return whether an error frame says that the controller lost a frame by overflow."""
     return bool(error_class & _CONTROLLER and len(data) > 1 and data[1] & _RX_OVERFLOW)

@@ -51,7 +51,7 @@ _ERROR_ID = "20000080"
 
 
 def frame_of(message: can.Message) -> Frame:
-    """The frame that a message of python-can stands for.
+    """Return the frame that a message of python-can stands for.
 
     Raises TypeError or ValueError where its time or identifier is no number, as from a damaged SQLite log.
     """
@@ -66,7 +66,7 @@ def frame_of(message: can.Message) -> Frame:
 
 
 def whole(message: can.Message) -> can.Message:
-    """The message; ValueError where it has other than the bytes that it says: its line was cut off."""
+    """Return the message; ValueError where it has fewer or more bytes than it says."""
     stated = message.dlc if message.is_fd else min(message.dlc, 8)
     if not (message.is_remote_frame or message.is_error_frame or len(message.data) == stated):
         raise ValueError(f"a frame of {stated} bytes has {len(message.data)}")
@@ -74,12 +74,12 @@ def whole(message: can.Message) -> can.Message:
 
 
 def is_candump(line: str) -> bool:
-    """Whether a line is one of candump, with or without a stamp."""
+    """Return whether a line is one of candump, with or without a stamp."""
     return any(pattern.match(line) for pattern in (_LOG_LINE, _CONSOLE_LINE, _UNSTAMPED))
 
 
 def log_line(line: str) -> str:
-    """What `candump -L` would write of a line that candump printed; any other line as it is.
+    """Return a line that candump printed as `candump -L` would write it; any other line unchanged.
 
     An error frame of any class gets the identifier by which python-can knows one.  Stamps by date are taken as UTC.
     Raises ValueError for a line without a stamp, and for one that was cut off.
@@ -120,7 +120,7 @@ def _seconds(found: re.Match[str]) -> str:
 
 
 def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
-    """Frames of a log's lines, the same that `can.CanutilsLogReader` reads.
+    """Return the frames of a log's lines, the same that `can.CanutilsLogReader` reads.
 
     Raises what the reader (ValueError, IndexError) or `lines` raises, or ValueError for half a byte,
     after the frames before that place.
@@ -129,7 +129,7 @@ def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
 
 
 def candump_batches(lines: Iterable[str]) -> Iterator[Batch]:
-    """As `candump_frames`, in lists with the channels."""
+    """Yield the frames of `candump_frames` in lists, with their channels."""
     for batch in _batches(iter(lines)):
         plain = _plain(_DIRECTION.sub("\n", "".join(batch)))
         if plain is None:
@@ -145,7 +145,7 @@ def candump_batches(lines: Iterable[str]) -> Iterator[Batch]:
 
 
 def of_message(message: can.Message, first: int = 0) -> Batch:
-    """A message of python-can as a batch; its channel is written as in the log, whose first channel is `first`."""
+    """Return a message of python-can as a batch; `first` is the number of the log's first channel."""
     channel = message.channel
     name = channel + first if isinstance(channel, int) else channel or ""
     return (str(name),), [frame_of(whole(message))]

@@ -14,7 +14,7 @@ WHOLE = ""
 
 
 class Reason(StrEnum):
-    """Why a frame or a value was not admitted; each is counted."""
+    """Reason why a frame or a value was not admitted; each is counted."""
 
     WRONG_LENGTH = "wrong_length"
     WRONG_SOURCE = "wrong_source"
@@ -36,7 +36,7 @@ class Reason(StrEnum):
 
 
 def path_of(message: str, signal: str) -> str:
-    """`Message.Signal`, or the name of a column."""
+    """Return `Message.Signal`, or the name of a column."""
     return message if signal == WHOLE else f"{message}.{signal}"
 
 
@@ -67,7 +67,7 @@ class Channel:
 
     @property
     def name(self) -> str:
-        """Such as "torque.FL", or "draft" for a channel of the whole vehicle."""
+        """Name such as "torque.FL", or "draft" for a channel of the whole vehicle."""
         return f"{self.quantity}.{self.wheel}" if self.wheel else self.quantity
 
     @property
@@ -86,7 +86,7 @@ class Column:
 
 @dataclass(slots=True)
 class Decoded:
-    """Columns by channel name; times of refused samples by channel name and reason; refused ones without a time."""
+    """Admitted samples by channel, times of refused ones by channel and reason, and refused ones without a time."""
 
     columns: dict[str, Column] = field(default_factory=dict)
     refused: dict[tuple[str, Reason], NDArray[np.float64]] = field(default_factory=dict)

@@ -25,7 +25,7 @@ _TABLE_ARRAY: NDArray[np.uint8] = np.frombuffer(_TABLE, dtype=np.uint8)
 
 
 def checksum_byte(message: Message) -> int | None:
-    """Byte that carries a message's Checksum; None without one that is an aligned byte."""
+    """Return the byte that carries a message's Checksum; None without one that is an aligned byte."""
     checksum = next((signal for signal in message.signals if signal.name == CHECKSUM), None)
     if checksum is None or checksum.length != 8:
         return None
@@ -34,12 +34,12 @@ def checksum_byte(message: Message) -> int | None:
 
 
 def checkable_byte(message: Message) -> int | None:
-    """The same of a message with a Counter too, so that others may act on it; None of any other."""
+    """Return the byte of the Checksum of a message that has a Counter too; None of any other."""
     return checksum_byte(message) if any(signal.name == COUNTER for signal in message.signals) else None
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8 SAE J1850 (polynomial 0x1D, start 0xFF, final xor 0xFF) of `data`, 0..255."""
+    """Return the CRC-8 SAE J1850 (polynomial 0x1D, start 0xFF, final xor 0xFF) of `data`, 0..255."""
     crc = _INIT
     for byte in data:
         crc = _TABLE[crc ^ byte]
@@ -47,7 +47,7 @@ def crc8(data: bytes) -> int:
 
 
 def frame_checksum(arbitration_id: int, data: bytes, checksum_byte_index: int) -> int:
-    """Checksum of one frame, 0..255: identifier (4 bytes, least significant first), then payload.
+    """Return the checksum of one frame, 0..255: identifier (4 bytes, least significant first), then payload.
 
     The byte that carries the checksum is left out.  Raises IndexError when `data` has no such
     byte, OverflowError when the identifier does not fit 4 bytes.
@@ -61,7 +61,7 @@ def frame_checksum(arbitration_id: int, data: bytes, checksum_byte_index: int) -
 def column_checksums(
     arbitration_ids: NDArray[np.int64], payload: NDArray[np.uint8], checksum_byte_index: int
 ) -> NDArray[np.uint8]:
-    """`frame_checksum` of many frames at once: identifiers (N,), payload (N, length) -> (N,)."""
+    """Return `frame_checksum` of many frames at once: identifiers (N,), payload (N, length) -> (N,)."""
     identifiers = arbitration_ids.astype("<u4").view(np.uint8).reshape(-1, _ID_BYTES)
     data = np.concatenate([identifiers, payload], axis=1)
     shares, start = _shares(data.shape[1], _ID_BYTES + checksum_byte_index)

@@ -25,7 +25,7 @@ LETTERS = frozenset({"N", "m", "g"})
 
 
 def unit_in(column: str) -> str:
-    """The unit with which a column's name ends, in brackets or as its last word; "" without one.
+    """Return the unit that ends a column's name, in brackets or as its last word; "" without one.
 
     Examples
     --------
@@ -50,7 +50,7 @@ def _is_unit(text: str) -> bool:
 
 
 def column_database(units: Mapping[str, str]) -> Database:
-    """The columns as messages, each numbered by its place.
+    """Return the columns of a table as messages, each numbered by its place.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def column_database(units: Mapping[str, str]) -> Database:
 
 
 def mapped_columns(config: Config) -> dict[str, str]:
-    """Unit of each column that the configuration maps, by its name."""
+    """Return the unit of each column that the configuration maps, by its name."""
     mapped = _signals(config.model_dump(exclude={"columns", "table", "folder"}))
     return {one["signal"]: one["unit"] if one["unit"] is not None else unit_in(one["signal"]) for one in mapped}
 

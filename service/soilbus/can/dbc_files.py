@@ -29,7 +29,7 @@ _SIGNAL = re.compile(r"(\w+)\.\w+")
 
 
 def load_databases(config: Config, mapped_only: bool = False) -> Database:
-    """All DBC files of the configuration as one database; with [columns] the mapped columns as one.
+    """Return all DBC files of the configuration as one database; with [columns] the mapped columns.
 
     With `mapped_only` messages are left out that can have no say in what is mapped, unless a mapped one is missing.
 
@@ -77,7 +77,7 @@ def _mapped(config: Config) -> set[str]:
 
 
 def checked_messages(config: Config, database: Database) -> frozenset[str]:
-    """Names of the messages that must carry a right Counter and Checksum.
+    """Return the names of the messages that must carry a right Counter and Checksum.
 
     Those are messages with both signals in DBC files that soilbus ships, and what
     `dbc.checked` names in the database; what another maker's Checksum means is not known.  Raises ConfigError
@@ -104,7 +104,7 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
 
 
 def output_database(config: Config) -> Database:
-    """The messages that soilbus sends, from the address of [j1939] where there is one; the DBC may hold others, too.
+    """Return the messages that soilbus sends, from the address of [j1939] where there is one.
 
     Raises ConfigError where it is missing, not a DBC, or lacks anything of a message of ours.
     """
@@ -148,7 +148,7 @@ def _unlike(message: Message, ours: Message) -> Iterator[str]:
 
 
 def filters_of(database: Database) -> list[dict[str, Any]]:
-    """Filters for python-can that pass the messages of a database only."""
+    """Return filters for python-can that pass the messages of a database only."""
     return [{"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages]
 
 

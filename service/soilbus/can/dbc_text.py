@@ -32,7 +32,7 @@ _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
 
 def check_multiplexers(text: str) -> None:
-    """Raise ValueError where the ranges of SG_MUL_VAL_ have more values than can be expanded, which the parser does."""
+    """Raise ValueError where the ranges of SG_MUL_VAL_ have too many values for the parser to expand."""
     left = MOST_MULTIPLEXER_VALUES
     for found in _RANGES.finditer(text):
         for low, high in _RANGE.findall(found["ranges"]):
@@ -45,12 +45,12 @@ def check_multiplexers(text: str) -> None:
 
 
 def message_names(text: str) -> set[str]:
-    """Names of the messages that the text defines."""
+    """Return the names of the messages that the text defines."""
     return {found["name"] for found in _MESSAGE.finditer(text)}
 
 
 def of_messages(text: str, names: set[str], also: Callable[[int], bool]) -> str:
-    """The text with no messages but those of these names, those that share their identifiers, and `also`.
+    """Return the DBC's text with these messages, those that share their identifiers, and `also`.
 
     `also` is asked with an extended identifier.
     """

@@ -41,7 +41,7 @@ _LIMITS = np.iinfo(np.int64)
 
 
 class SignalColumn(NamedTuple):
-    """One signal of N frames.
+    """Values of one signal in N frames.
 
     `raw` (N,): codes, int64 (uint64 for 64 unsigned bits, float64 for float signals).
     `physical` (N,): scaled value as cantools gives it, int64, uint64, float64, or objects where
@@ -78,7 +78,7 @@ class _Group:
 
 
 class ColumnDecoder:
-    """Decodes the named signals of one message, and the multiplexers they hang on.
+    """Decoder of the named signals of one message, and of the multiplexers they hang on.
 
     Raises KeyError for a signal that the message does not have and ValueError for one that
     cannot be cut out: outside the message, longer than 64 bits, or defined twice.
@@ -94,7 +94,7 @@ class ColumnDecoder:
         self.rows = tuple(group.rows for group in self._groups)
 
     def columns(self, payload: Payload) -> dict[str, SignalColumn]:
-        """Raw codes, physical values and presence by signal name; payload (N, message length).
+        """Return the raw codes, physical values and presence by signal name; payload (N, message length).
 
         Signals that the wanted ones hang on are among them.  Raises ValueError when the payload
         has another shape or is not bytes.
@@ -102,7 +102,7 @@ class ColumnDecoder:
         return self.columns_of(self.blocks(payload))
 
     def blocks(self, payload: Payload) -> list[Block]:
-        """Everything decoded, block by block; `rows` names each block's rows.  Errors as `columns`."""
+        """Return everything decoded, block by block; `rows` names each block's rows.  Errors as `columns`."""
         if payload.ndim != 2 or payload.shape[1] != self._length or payload.dtype != np.uint8:
             expected = f"uint8 (N, {self._length})"
             raise ValueError(f"{self.message.name}: payload is {payload.dtype} {payload.shape}, not {expected}")
@@ -110,7 +110,7 @@ class ColumnDecoder:
         return [(c, _scaled(group, c)) for group, c in zip(self._groups, codes, strict=True)]
 
     def columns_of(self, blocks: Sequence[Block]) -> dict[str, SignalColumn]:
-        """The columns that `blocks` holds; see `columns`."""
+        """Return the columns that `blocks` holds; see `columns`."""
         columns: dict[str, SignalColumn] = {}
         for rows, (codes, values) in zip(self.rows, blocks, strict=True):
             for name, row in rows:
@@ -120,17 +120,17 @@ class ColumnDecoder:
         return columns
 
     def raw(self, payload: Payload) -> dict[str, NDArray[Any]]:
-        """Raw codes (N,) by signal name; see `columns`."""
+        """Return the raw codes (N,) by signal name; see `columns`."""
         columns = self.columns(payload)
         return {name: columns[name].raw for name in self.signals}
 
     def decode(self, payload: Payload) -> dict[str, NDArray[Any]]:
-        """Physical values (N,) by signal name; see `columns`, and `present` for multiplexed signals."""
+        """Return the physical values (N,) by signal name; see `columns`, and `present` for multiplexed signals."""
         columns = self.columns(payload)
         return {name: columns[name].physical for name in self.signals}
 
     def present(self, payload: Payload) -> dict[str, NDArray[np.bool_]]:
-        """Whether each frame carries each signal, (N,) by signal name."""
+        """Return whether each frame carries each signal, (N,) by signal name."""
         everywhere = np.ones(len(payload), dtype=np.bool_)
         columns = self.columns(payload)
         masks = {name: columns[name].present for name in self.signals}
@@ -138,14 +138,14 @@ class ColumnDecoder:
 
 
 def code_limits(signal: Signal) -> tuple[int, int]:
-    """Least and greatest raw code that the bits of an integer signal can hold."""
+    """Return the least and greatest raw code that the bits of an integer signal can hold."""
     if signal.is_signed:
         return -(1 << (signal.length - 1)), (1 << (signal.length - 1)) - 1
     return 0, (1 << signal.length) - 1
 
 
 def check_decodable(message: Message, name: str) -> Signal:
-    """The signal of that name; KeyError or ValueError as `ColumnDecoder` says."""
+    """Return the signal of that name; KeyError or ValueError as `ColumnDecoder` says."""
     found = [s for s in message.signals if s.name == name]
     if not found:
         raise KeyError(name)
@@ -249,7 +249,7 @@ def _lane(signal: Signal, length: int) -> np.dtype[Any] | None:
 
 
 def shared(column: NDArray[Any]) -> Any:
-    """The number that all rows share, else the column itself."""
+    """Return the number that all rows share, else the column itself."""
     return column[0, 0] if (column == column[0, 0]).all() else column
 
 

@@ -43,19 +43,19 @@ class Batch:
     _blocks: list[Block] | None = None
 
     def blocks(self, decoder: ColumnDecoder) -> list[Block]:
-        """The payload decoded by the message's decoder."""
+        """Return the payload as the message's decoder decodes it."""
         if self._blocks is None:
             self._blocks = decoder.blocks(self.payload)
         return self._blocks
 
     def where(self, mask: Mask) -> Batch:
-        """Those of a mask (N,)."""
+        """Return the frames of a mask (N,)."""
         return Batch(self.t[mask], self.ids[mask], self.payload[mask])
 
 
 @dataclass(slots=True)
 class Inbox:
-    """One message: its frames not yet taken, and what must be remembered between batches."""
+    """Inbox of one message: frames not yet taken, and what is remembered between batches."""
 
     message: Message
     channels: tuple[Channel, ...]
@@ -82,7 +82,7 @@ class Inbox:
     """Frames that the counters of a checked message skip: lost, or refused for their checksum."""
 
     def forget(self) -> None:
-        """As if no frame had ever come."""
+        """Forget all frames of this message, and its last stamp, counter and sender."""
         self.frames.clear()
         self.late.clear()
         self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
@@ -92,7 +92,7 @@ class Inbox:
 
 
 def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> Inbox:
-    """An empty inbox; is_open: heard from any source.  ValueError where a message to be checked cannot be."""
+    """Return an empty inbox; `is_open`: it hears any source.  ValueError where a message cannot be checked."""
     place = checkable_byte(message) if checked else None
     if checked and place is None:
         raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
@@ -112,7 +112,7 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
 
 
 def popped(inbox: Inbox, until: float) -> list[Frame]:
-    """Takes the frames before `until` out of the inbox."""
+    """Take the frames before `until` out of the inbox and return them."""
     frames, inbox.frames = inbox.frames, []
     if until == math.inf:
         return frames
@@ -121,7 +121,7 @@ def popped(inbox: Inbox, until: float) -> list[Frame]:
 
 
 def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where the payload does not give the Checksum; None where it does throughout, or none is asked for."""
+    """Return False where the payload does not give the Checksum; None where all do, or none is asked for."""
     if inbox.checksum_byte is None:
         return None
     due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
@@ -130,7 +130,7 @@ def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
 
 
 def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where time goes back or is no number; None where it goes on throughout."""
+    """Return False where time goes back or is no number; None where it always goes on."""
     t = batch.t
     first, last = float(t[0]), float(t[-1])
     rises = np.count_nonzero(t[1:] >= t[:-1]) == len(t) - 1  # never of a nan
@@ -146,7 +146,7 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where a frame repeats the counter of the one before it from the same sender; None where none does.
+    """Return False where a frame repeats the counter of its sender's last one; None where none does.
 
     What the counters skip is counted in `inbox.missed`; what cannot be trusted is kept for `of_one_sender`.
     """
@@ -189,12 +189,12 @@ def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mas
 
 
 def of_one_sender(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where `counter_moved` found that the counters cannot be trusted; None where they can throughout."""
+    """Return False where a second sender makes the counters useless; None where there is none."""
     return None if inbox.untrusted is None else ~inbox.untrusted
 
 
 def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where a frame comes once more: counted twice, its noise would seem smaller than it is.  None where none."""
+    """Return False where a frame comes a second time, as its noise would count twice; None where none does."""
     t_before, id_before, data_before = inbox.last_frame
     inbox.last_frame = float(batch.t[-1]), int(batch.ids[-1]), batch.payload[-1].tobytes()
     t = batch.t

@@ -27,7 +27,7 @@ _PDU2_MASK = 0x03FFFF00
 
 
 def group_mask(arbitration_id: int) -> int:
-    """Bits of a 29-bit identifier that tell its parameter group.
+    """Return the bits of a 29-bit identifier that tell its parameter group.
 
     Below PDU format 240 (PDU1) the second byte is a destination address and no part of the
     group; from 240 (PDU2) it is.
@@ -36,17 +36,17 @@ def group_mask(arbitration_id: int) -> int:
 
 
 def pgn_of(arbitration_id: int) -> int:
-    """Parameter group number of a 29-bit identifier, data page bits included."""
+    """Return the parameter group number of a 29-bit identifier, data page bits included."""
     return (arbitration_id & group_mask(arbitration_id)) >> 8
 
 
 def source_of(arbitration_id: int) -> int:
-    """Source address of a 29-bit identifier."""
+    """Return the source address of a 29-bit identifier."""
     return arbitration_id & 0xFF
 
 
 def name_of(unit: J1939) -> int:
-    """The NAME of a unit that is content with one address (ISO 11783-5), as 64 bits."""
+    """Return the NAME of a unit that is content with one address (ISO 11783-5), as 64 bits."""
     name = unit.identity_number | unit.manufacturer_code << 21
     name |= unit.ecu_instance << 32 | unit.function_instance << 35 | unit.function << 40
     return name | unit.device_class << 49 | unit.device_class_instance << 56 | unit.industry_group << 60
@@ -54,7 +54,7 @@ def name_of(unit: J1939) -> int:
 
 @dataclass(slots=True)
 class SourceLock:
-    """Keeps to one source of a parameter group.
+    """Lock on one source address of a parameter group.
 
     The first source heard counts until it is silent for `patience` [s]; `own`, the address that
     the DBC names, takes over whenever it talks.
@@ -67,11 +67,11 @@ class SourceLock:
 
     @classmethod
     def at_cycle(cls, own: int, cycle_time: float) -> SourceLock:
-        """With patience for a message that comes every `cycle_time` [s] (0: unknown)."""
+        """Return a lock with patience for a message that comes every `cycle_time` [s] (0: unknown)."""
         return cls(own, max(LOCK_RELEASE, LOCK_CYCLES * cycle_time))
 
     def admits(self, t: float, source: int) -> bool:
-        """Whether a frame of `source` at t [s] counts; moves the lock where it must."""
+        """Return whether a frame of `source` at t [s] counts; move the lock where it must."""
         if source != self.source and source != self.own and t - self.heard <= self.patience:
             return False
         self.source = source

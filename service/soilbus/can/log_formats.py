@@ -46,11 +46,11 @@ class Format(NamedTuple):
 
 
 class MissingExtraError(Exception):
-    """What reads this format is not installed; the text says what to install."""
+    """The extra that reads this format is not installed; the text says what to install."""
 
 
 def format_of(head: bytes) -> Format:
-    """The format of a log by its first bytes; ValueError where it is none, with what it is instead."""
+    """Return the format of a log by its first bytes; ValueError says what it is instead."""
     for mark, found in _BINARY.items():
         if head.startswith(mark):
             return found
@@ -95,7 +95,7 @@ RELATIVE = "its stamps are relative to the event before: save it with absolute o
 
 
 def asc(lines: Iterable[str]) -> Iterator[Batch]:
-    """Frames of a Vector ASC log.
+    """Yield the frames of a Vector ASC log.
 
     Its stamps count from its begin.  Events between frames do not come from the reader, so stamps that only say how
     long after the last event each came cannot be summed up: ValueError.
@@ -160,7 +160,7 @@ def _csv_of(header: str) -> _Csv | None:
 
 
 def is_csv_of_frames(header: str) -> bool:
-    """Whether a CSV with this first line is a log of frames."""
+    """Return whether a CSV with this first line is a log of frames."""
     return _csv_of(header) is not None
 
 
@@ -192,7 +192,7 @@ _BUSMASTER_DATE = re.compile(r"\*\*\*START DATE AND TIME (\d+):(\d+):(\d+) ")
 
 
 def busmaster(lines: Iterable[str]) -> Iterator[Batch]:
-    """Frames of a log of BUSMASTER; its stamps are the time of the day, or count from its begin.
+    """Yield the frames of a log of BUSMASTER; stamps are the time of the day, or count from its begin.
 
     Raises ValueError where they only say how long after the frame before each came.
     """
@@ -290,7 +290,7 @@ def _blf(stream: BufferedReader) -> Iterator[Batch]:
 
 @contextmanager
 def placed_copy(stream: BufferedReader) -> Iterator[Path]:
-    """The path of a copy of a stream, for libraries that go to and fro in a file."""
+    """Give the path of a copy of a stream, for libraries that seek in a file."""
     with NamedTemporaryFile(prefix="soilbus-") as file:
         copyfileobj(stream, file)
         file.flush()

@@ -22,7 +22,7 @@ _WRITERS: dict[str, Callable[[Any], Any]] = {
 
 
 def format_of(path: Path) -> tuple[str, bool]:
-    """Suffix of the format, and whether it is packed, as a BLF is already; ValueError with one line for another."""
+    """Return the suffix of the format, and whether to pack it; ValueError for an unknown format."""
     *_, kind, last = ("", "", *(suffix.lower() for suffix in path.suffixes))
     is_packed = last == ".gz"
     kind = kind if is_packed else last
@@ -32,7 +32,7 @@ def format_of(path: Path) -> tuple[str, bool]:
 
 
 def write_log(messages: Iterable[can.Message], path: Path) -> None:
-    """Write a log in the format of the file's suffix (.log, .asc, .csv, .blf, .log.gz); it appears only when complete.
+    """Write a log in the format of the file's suffix (.log, .asc, .csv, .blf, .log.gz), whole or not at all.
 
     Raises
     ------

@@ -30,7 +30,7 @@ LEAST_STAMPS = 20
 
 
 class LogError(Exception):
-    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place.
+    """Error of a log that cannot be read to its end; `windows` ended before the damage.
 
     `lasting` is False where the fault is of the machine that reads it, not of what is in the log.
     """
@@ -43,7 +43,7 @@ class LogError(Exception):
 
 
 class OtherBus(LogError):
-    """No frame of a log is in the DBC: of another bus, or of another vehicle than the configuration's."""
+    """Error of a log without any frame of the DBC: another bus, or another vehicle."""
 
 
 class Log:
@@ -79,22 +79,22 @@ class Log:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name of the log in messages."""
         return "standard input" if str(self.path) == "-" else str(self.path)
 
     @property
     def left_out(self) -> int:
-        """Frames of other channels."""
+        """Number of frames of other channels."""
         return self.channels.total() - self.channels[self.chosen] if self.wanted else 0
 
     @property
     def note(self) -> str:
-        """What to say of its channels as far as it was read; empty where there is nothing."""
+        """Line on the log's channels as far as it was read; empty where there is nothing to say."""
         others = sorted(self.channels.keys() - {self.chosen})
         if not self.wanted:
             mixed = f"{self.name}: frames of {_listed(others)} are read together; --channel chooses one"
             return mixed if len(others) > 1 else ""
-        if others:
+        if others and self.chosen:
             return (
                 f"{self.name}: frames of {self.chosen} are read; those of {_listed(others)} are left out"
                 " (bus.channel, --channel)"
@@ -104,7 +104,7 @@ class Log:
         return ""
 
     def frames(self) -> Iterator[Frame]:
-        """Its frames.
+        """Yield its frames.
 
         Raises
         ------
@@ -213,7 +213,7 @@ class Log:
 
 
 def read_frames(path: Path, channel: str = "") -> Iterator[Frame]:
-    """The frames of one channel of a log, of all channels by default; LogError as `Log.frames`."""
+    """Return the frames of one channel of a log, of all channels by default; LogError as `Log.frames`."""
     return Log(path, channel).frames()
 
 

@@ -83,7 +83,7 @@ class _Role(NamedTuple):
 
 
 def channels_of(config: Config, database: Database) -> list[Channel]:
-    """One channel for each role that the configuration maps, wheels first.
+    """Return one channel for each role that the configuration maps, wheels first.
 
     Raises ConfigError with a line for each fault: a message or signal that the DBC does not
     have (the nearest name is suggested), a unit of another dimension than the role, a signal
@@ -104,7 +104,7 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
 
 
 def without_unit(channels: Iterable[Channel], database: Database) -> list[Channel]:
-    """Channels whose signal has no unit, so that SI was assumed."""
+    """Return the channels whose signal has no unit, so that SI was assumed."""
     return [c for c in channels if c.quantity != LOCK and _is_bare(_signal(c, database))]
 
 
@@ -185,7 +185,7 @@ def _usual_timeout(role: _Role, message: Message) -> float | None:
 
 
 def found_signal(database: Database, path: str) -> tuple[Message, Signal]:
-    """The message and signal of a "Message.Signal", or of a column by its name."""
+    """Return the message and signal of a "Message.Signal", or of a column by its name."""
     messages = {m.name: m for m in database.messages}
     if path in messages and messages[path].signals[0].name == WHOLE:
         return messages[path], messages[path].signals[0]
@@ -328,7 +328,7 @@ def _percentage(quantity: str, signal: Signal, reference_torque: float) -> tuple
 
 
 def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple[float, float]:
-    """Least and greatest SI value that a working sensor of this vehicle can give."""
+    """Return the least and greatest SI value that a working sensor of this vehicle can give."""
     weight = STANDARD_GRAVITY * (config.vehicle.mass if config.vehicle else _HEAVY)
     radius = 1.0
     if isinstance(part, Wheel):

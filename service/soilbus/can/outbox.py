@@ -9,7 +9,7 @@ LATE = 0.1
 
 
 class Outbox:
-    """One slot for each identifier.  A newer frame takes the place of the one that waits, and its turn."""
+    """Queue of frames to send, a slot for each identifier: a newer frame replaces the one that waits, in its turn."""
 
     def __init__(self) -> None:
         self.dropped = 0
@@ -20,12 +20,12 @@ class Outbox:
         return len(self._waiting)
 
     def put(self, frame: Frame, now: float) -> None:
-        """A frame made at the monotonic time `now` [s]."""
+        """Keep a frame made at the monotonic time `now` [s] until its turn."""
         self.dropped += frame.arbitration_id in self._waiting
         self._waiting[frame.arbitration_id] = frame, now
 
     def first(self, now: float) -> Frame | None:
-        """The frame whose turn it is; those that are late by now are dropped."""
+        """Return the frame whose turn it is; drop those that are late by now."""
         for identifier, (frame, made) in list(self._waiting.items()):
             if now - made <= LATE:
                 return frame
@@ -34,10 +34,10 @@ class Outbox:
         return None
 
     def done(self, frame: Frame) -> None:
-        """It is out."""
+        """Forget the first frame, which is sent."""
         del self._waiting[frame.arbitration_id]
 
     def clear(self) -> None:
-        """The bus is gone; what waits now would be stale when it is back."""
+        """Drop all frames, as the bus is gone and they would be stale later."""
         self.dropped += len(self._waiting)
         self._waiting.clear()

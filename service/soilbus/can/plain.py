@@ -47,12 +47,12 @@ class _BlockPlan:
 
 @dataclass(frozen=True, slots=True)
 class PlainPlan:
-    """What is known in advance of a message whose channels are all integer codes."""
+    """Plan for decoding a message whose channels are all integer codes."""
 
     blocks: tuple[_BlockPlan, ...]
 
     def samples(self, blocks: Sequence[Block]) -> dict[str, NDArray[np.float64]] | None:
-        """SI values (N,) by channel name; None where any code needs the detailed judgement.
+        """Return the SI values (N,) by channel name; None where any code needs the detailed judgement.
 
         `blocks` are those of the decoder, for N frames.
         """
@@ -71,7 +71,7 @@ class PlainPlan:
 def plain_plan(
     message: Message, channels: Sequence[Channel], rules: Sequence[CodeRule], decoder: ColumnDecoder
 ) -> PlainPlan | None:
-    """The plan of a message's channels; None where floats, multiplexers or very long codes are among them."""
+    """Return the plan of a message's channels; None with floats, multiplexers or very long codes."""
     signals = {s.name: s for s in message.signals}
     if not all(_is_simple(signals[name]) for rows in decoder.rows for name, _ in rows):
         return None

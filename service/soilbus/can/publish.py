@@ -26,7 +26,7 @@ _BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame, ready to send."""
+    """Frame that is ready to send."""
 
     arbitration_id: int
     extended: bool
@@ -35,7 +35,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class ValueCodes:
-    """How values of one integer signal become raw codes.
+    """Conversion of values of one integer signal to raw codes.
 
     Physical value = scale * code + offset.  Valid codes are lowest..highest.  None and
     what is not finite become `not_available`.  A value outside the range becomes `error`,
@@ -54,7 +54,7 @@ class ValueCodes:
     names: Mapping[str, int]
 
     def code(self, value: Any) -> int:
-        """Raw code of one value: number, name of the value table, or None.
+        """Return the raw code of one value: number, name of the value table, or None.
 
         Raises ValueError for an unknown name, TypeError for what is no value at all.
         """
@@ -75,7 +75,7 @@ class ValueCodes:
         return self.highest if self.saturates and code > self.highest else self.error
 
     def column(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """`code` of many numbers at once: shape (N,) to (N,), nan for not available."""
+        """Return `code` of many numbers (N,) at once; nan means not available."""
         finite = np.isfinite(values)
         codes = np.rint((np.where(finite, values, self.offset) - self.offset) / self.scale)
         above = float(self.highest if self.saturates else self.error)
@@ -84,7 +84,7 @@ class ValueCodes:
 
 
 def value_codes(signal: Signal) -> ValueCodes:
-    """The codes of a signal of any maker's DBC.
+    """Return the conversion for a signal of any maker's DBC.
 
     Without names in the value table, not available is the most negative code of a signed
     signal and all ones of an unsigned one; error is the J1939 code where the range leaves
@@ -152,7 +152,7 @@ class Publisher:
         """Cycle time [s] by message name, from the DBC's attribute GenMsgCycleTime."""
 
     def frame(self, message: str, values: Mapping[str, Any]) -> Frame:
-        """The next frame of a message; signals without a value are sent as not available.
+        """Return the next frame of a message; signals without a value are sent as not available.
 
         Values are in the DBC's units, or names of the value table.  Raises KeyError for a
         message or signal that the DBC does not have (counter and checksum are not the

@@ -196,7 +196,7 @@ UNIT_ALONE = ""
 
 
 class Slot(NamedTuple):
-    """A role and the wheel or axle that it is of; "" for the whole vehicle, or where the place is not known."""
+    """Role with its wheel or axle; "" for the whole vehicle, or where the place is not known."""
 
     role: str
     place: str
@@ -204,7 +204,7 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One signal as one slot's value: its score, and in words what speaks against it."""
+    """Signal as a candidate for one slot: its score, and what speaks against it."""
 
     slot: Slot
     message: str
@@ -229,13 +229,13 @@ class Candidate:
         return path_of(self.message, self.signal)
 
     def changed(self, by: float, note: str = "") -> Candidate:
-        """The same with another score, and a note on why."""
+        """Return the candidate with another score and a note on why."""
         return replace(self, score=self.score + by, notes=(*self.notes, note) if note else self.notes)
 
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """What is asserted by slot, the candidates of slots that stay open, best first, rivals of asserted ones, and
+    """Result of the matching: asserted signals by slot, candidates of open slots, rivals of asserted ones, and
     signals of which only the unit is known."""
 
     asserted: dict[Slot, Candidate] = field(default_factory=dict)
@@ -245,7 +245,7 @@ class Assignment:
 
 
 def candidates(database: Database) -> list[Candidate]:
-    """Every signal as a value of every slot that it may fill, with a score from LISTED up.
+    """Return every signal for every slot that it may fill, with a score from LISTED up.
 
     A signal that may fill none, but has a unit of ours, is one of UNIT_ALONE with score 0.
 
@@ -261,7 +261,7 @@ def candidates(database: Database) -> list[Candidate]:
 
 
 def axles_of(assignment: Assignment) -> dict[str, tuple[str, str]]:
-    """Names of the axles that an assignment's places are of, front to rear, with the left and the right wheel."""
+    """Return the names of an assignment's axles, front to rear, with the left and the right wheel."""
     letters = {slot.place[:1] for slot in (*assignment.asserted, *assignment.open)}
     numbers = [name for name in _LETTERS if name.isdigit()]
     three = ("front", "middle", "rear") if letters & {"M", "m"} else ("front", "rear")
@@ -269,7 +269,7 @@ def axles_of(assignment: Assignment) -> dict[str, tuple[str, str]]:
 
 
 def assigned(found: Iterable[Candidate]) -> Assignment:
-    """Each signal to one slot, by the largest sum of scores; what is not clear stays open.
+    """Assign each signal to one slot by the largest sum of scores; what is not clear stays open.
 
     Returns
     -------
@@ -324,18 +324,18 @@ def _take_sole(out: Assignment) -> None:
 
 
 def dimensions_of(role: str) -> tuple[str, ...]:
-    """Dimensions that the unit of a role's signal may have."""
+    """Return the dimensions that the unit of a role's signal may have."""
     return _ROLES[role][0]
 
 
 def described(candidate: Candidate) -> str:
-    """A candidate for a comment: path, unit and what speaks against it."""
+    """Return a candidate for a comment: path, unit and what speaks against it."""
     said = [candidate.unit] * bool(candidate.unit) + list(candidate.notes)
     return f"{candidate.path} ({', '.join(said)})" if said else candidate.path
 
 
 def is_word_in(name: Candidate | str, *words: str) -> bool:
-    """Whether a signal's name, or a candidate's with that of its message, has one of these words, however spelt."""
+    """Return whether the name of a signal, or of a candidate and its message, has one of these words."""
     texts = (name,) if isinstance(name, str) else (name.signal, name.message)
     return any(word in _words(text) for text in texts for word in words)
 

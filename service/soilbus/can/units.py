@@ -10,7 +10,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """`value in SI = factor * value`; none of our quantities has a unit with an offset."""
+    """Unit with its factor: `value in SI = factor * value`; none of our quantities has an offset."""
 
     dimension: str
     factor: float
@@ -86,7 +86,7 @@ _WHY_NOT = {
 
 
 def unit_of(text: str | None) -> Unit | None:
-    """The unit that a DBC's text means; None when it is empty.
+    """Return the unit that a DBC's text means; None when it is empty.
 
     Raises ValueError, with the reason, for a text that names no unit known here.
     """

@@ -53,7 +53,7 @@ _OF_WHAT = re.compile(r"\b(signal|data|values?|status|state|quality|measurement|
 
 @dataclass(frozen=True, slots=True)
 class CodeRule:
-    """Codes of one signal that carry a value.
+    """Rule which raw codes of a signal carry a value.
 
     `low`..`high` are raw codes for integer signals and physical values for float signals (the
     DBC's range, or all that the bits can hold); `bands` the first reserved, error and
@@ -68,7 +68,7 @@ class CodeRule:
 
 
 def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
-    """The rule that a signal's DBC entry implies.
+    """Return the rule that a signal's DBC entry implies.
 
     `is_standard`: of a parameter group of the standards, where the top codes are no values, whatever the DBC's range.
     """
@@ -90,7 +90,7 @@ def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
 
 
 def meaning(name: str) -> Reason | None:
-    """Why a code of that name in a value table is no value; None when it is one."""
+    """Return why a code of that name in a value table is no value; None when it is one."""
     text = _in_words(name)
     if _NOT_AVAILABLE.search(text):
         return Reason.NOT_AVAILABLE
@@ -100,14 +100,14 @@ def meaning(name: str) -> Reason | None:
 
 
 def vouches(name: str) -> bool:
-    """Whether a code of that name in a value table says that another signal is valid, and nothing else."""
+    """Return whether a code of that name in a value table says that another signal is valid."""
     text = _NO_FAULT.sub("ok", _in_words(name))
     rest, count = _VOUCHING.subn("", _OF_WHAT.sub("", text))
     return meaning(name) is None and count > 0 and not rest.strip()
 
 
 def vouching_codes(signal: Signal) -> tuple[int, ...]:
-    """Raw codes that vouch for another signal by their names in the value table; () where no name says so."""
+    """Return the raw codes that vouch for another signal by their names in the value table; () without any."""
     return tuple(sorted(code for code, name in (signal.choices or {}).items() if vouches(str(name))))
 
 
@@ -118,7 +118,7 @@ def _in_words(name: str) -> str:
 
 
 def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Verdicts:
-    """Verdict (N,) on the signal's own codes: special codes before the range."""
+    """Return the verdict (N,) on the signal's own codes: special codes before the range."""
     verdict = np.zeros(len(raw), dtype=np.uint8)
     seen = physical if rule.is_float else raw
     outside = (seen < rule.low) | (seen > rule.high)
@@ -134,7 +134,7 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
 
 
 def judge_validity(channel: Channel, length: int, signed: bool, column: SignalColumn) -> Verdicts:
-    """Verdict (N,) of the signal that vouches for another one, `length` bits long."""
+    """Return the verdict (N,) by the signal, `length` bits long, that vouches for another one."""
     raw = column.raw
     verdict = np.full(len(raw), _VERDICT[Reason.NOT_VALID], dtype=np.uint8)
     bands = None if signed else _BANDS.get(length)
@@ -149,7 +149,7 @@ def judge_validity(channel: Channel, length: int, signed: bool, column: SignalCo
 
 
 def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArray[np.float64]:
-    """Values (N,) in SI; marks in `verdict` those admitted so far that are implausible."""
+    """Return values (N,) in SI; mark admitted ones that are implausible in `verdict`."""
     with np.errstate(over="ignore"):
         value: NDArray[np.float64] = channel.factor * physical.astype(np.float64) + channel.offset
     inside = (value >= channel.low) & (value <= channel.high)  # False for nan

@@ -42,7 +42,7 @@ _ANCILLARY = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(_COUNT.size)
 
 
 class Received(NamedTuple):
-    """What the daemon reads of python-can's Message, without the price of one.  timestamp [s] is the kernel's."""
+    """Frame with what the daemon reads of python-can's Message, at less cost; the stamp is the kernel's."""
 
     timestamp: float
     arbitration_id: int
@@ -55,20 +55,20 @@ class Received(NamedTuple):
 
 
 class MessageBus(Protocol):
-    """What is used of an interface of python-can (can.BusABC)."""
+    """Part of python-can's interface (can.BusABC) that is used."""
 
     def recv(self, timeout: float | None = None, /) -> Received | can.Message | None:
-        """The next frame, or None after `timeout` [s]."""
+        """Return the next frame, or None after `timeout` [s]."""
 
     def send(self, message: can.Message, /) -> None:
         """Hand one frame to the driver."""
 
     def shutdown(self) -> None:
-        """Let go of it."""
+        """Close the interface."""
 
 
 class Wire(Protocol):
-    """An open bus.  All raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present."""
+    """Open bus.  All methods raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present."""
 
     overruns: int
     """Frames that came and were dropped for want of room since it was opened."""
@@ -76,23 +76,23 @@ class Wire(Protocol):
     """Bytes of the buffer in which frames wait for us."""
 
     def recv(self, timeout: float) -> Received | can.Message | None:
-        """The next frame, or None after `timeout` [s]."""
+        """Return the next frame, or None after `timeout` [s]."""
 
     def stamping_time(self) -> float:
-        """The present time [s] by the clock that stamps frames as they come; nan where that is not known."""
+        """Return the present time [s] by the clock that stamps frames as they come; nan where that is not known."""
 
     def heard_until(self) -> float:
-        """Stamp [s] before which no frame can be handed out any more; -inf where that is not known."""
+        """Return the stamp [s] before which no frame can come any more; -inf where that is not known."""
 
     def send(self, frame: Frame) -> None:
         """Hand one frame to the driver, never waiting."""
 
     def shutdown(self) -> None:
-        """Let go of it."""
+        """Close the bus."""
 
 
 def wire_of(bus: MessageBus) -> Wire:
-    """The bus that python-can has opened, by its socket where it is the kernel's."""
+    """Return a Wire for the bus that python-can has opened, by its socket where it is the kernel's."""
     own = getattr(bus, "socket", None)
     if isinstance(own, socket.socket) and own.family == socket.AF_CAN:
         return SocketWire(bus, own)
@@ -100,7 +100,7 @@ def wire_of(bus: MessageBus) -> Wire:
 
 
 def is_multicast(bus: MessageBus) -> bool:
-    """Whether a bus is a multicast group of python-can (interface udp_multicast)."""
+    """Return whether a bus is a multicast group of python-can (interface udp_multicast)."""
     return type(bus).__module__.startswith("can.interfaces.udp_multicast")
 
 
@@ -120,7 +120,7 @@ class SocketWire:
         self._poll.register(own, select.POLLIN)
 
     def recv(self, timeout: float) -> Received | None:
-        """As Wire; frames of this socket itself, which [bus] may ask for, are passed over."""
+        """Return the next frame as Wire does; frames of this socket itself are passed over."""
         frame = self._next()
         if frame is None and timeout > 0.0:
             time.sleep(min(timeout, GATHER))
@@ -152,26 +152,26 @@ class SocketWire:
         )  # fmt: skip
 
     def stamping_time(self) -> float:
-        """As Wire."""
+        """Return the time as Wire does."""
         return time.time()
 
     def heard_until(self) -> float:
-        """As Wire; a frame that is stamped is in the socket within STAMPED."""
+        """Return the stamp as Wire does; a frame that is stamped is in the socket within STAMPED."""
         now = time.time()
         return -math.inf if self._poll.poll(0) else now - STAMPED
 
     def send(self, frame: Frame) -> None:
-        """As Wire."""
+        """Send as Wire does."""
         word = frame.arbitration_id | _EXTENDED if frame.extended else frame.arbitration_id
         self._socket.send(_FRAME.pack(word, len(frame.data), frame.data))
 
     def shutdown(self) -> None:
-        """As Wire."""
+        """Close as Wire does."""
         self._bus.shutdown()
 
 
 class MessageWire:
-    """Any other interface of python-can."""
+    """Bus of any other interface of python-can."""
 
     overruns, room = 0, math.inf  # none of them can tell
 
@@ -179,29 +179,29 @@ class MessageWire:
         self._bus = bus
 
     def recv(self, timeout: float) -> Received | can.Message | None:
-        """As Wire."""
+        """Return the next frame as Wire does."""
         return self._bus.recv(timeout)
 
     def stamping_time(self) -> float:
-        """As Wire: devices have clocks of their own."""
+        """Return nan: devices have clocks of their own."""
         return math.nan
 
     def heard_until(self) -> float:
-        """As Wire."""
+        """Return the stamp as Wire does."""
         return -math.inf
 
     def send(self, frame: Frame) -> None:
-        """As Wire."""
+        """Send as Wire does."""
         message = can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
         self._bus.send(message)
 
     def shutdown(self) -> None:
-        """As Wire."""
+        """Close as Wire does."""
         self._bus.shutdown()
 
 
 class MulticastWire(MessageWire):
-    """A multicast group: every frame that is sent comes back to its sender too.
+    """Multicast group, in which every sent frame comes back to its sender.
 
     All senders share one port, so the address does not tell whose a frame is. An own frame is known by identifier and
     data (with our counter in them) within ECHO_TIME of its sending, as often as it was sent.
@@ -212,7 +212,7 @@ class MulticastWire(MessageWire):
         self._echoes: dict[tuple[int, bytes], list[float]] = {}
 
     def recv(self, timeout: float) -> Received | can.Message | None:
-        """As Wire; own frames are passed over."""
+        """Return the next frame as Wire does; own frames are passed over."""
         message = super().recv(timeout)
         if message is None or not self._echoes:
             return message
@@ -223,7 +223,7 @@ class MulticastWire(MessageWire):
         return None if expected else message
 
     def send(self, frame: Frame) -> None:
-        """As Wire."""
+        """Send as Wire does."""
         now = time.monotonic()
         if len(self._echoes) >= MAX_ECHOES:  # of a group that this host does not hear
             self._echoes = {key: times for key, times in self._echoes.items() if times[-1] > now - ECHO_TIME}
@@ -232,7 +232,7 @@ class MulticastWire(MessageWire):
 
 
 def error_number(error: Exception) -> int | None:
-    """errno of what a bus raised; EAGAIN for python-can's own full buffer, which has none."""
+    """Return the errno of what a bus raised; EAGAIN for python-can's own full buffer."""
     if isinstance(error, OSError):
         return error.errno
     number = getattr(error, "error_code", None)

@@ -24,7 +24,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """Parser of a number in a range, for argparse."""
+    """Return the parser of a number in a range, for argparse."""
 
     def number(text: str) -> float:
         try:
@@ -39,14 +39,14 @@ def between(low: float, high: float) -> Callable[[str], float]:
 
 
 def natural(text: str) -> int:
-    """Parser of a whole number that is not negative, for argparse."""
+    """Return the parser of a whole number that is not negative, for argparse."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 up")
     return int(text)
 
 
 def counted(text: str) -> int:
-    """Parser of a whole number above zero, for argparse."""
+    """Return the parser of a whole number above zero, for argparse."""
     number = natural(text)
     if number == 0:
         raise argparse.ArgumentTypeError("0 is not enough")
@@ -54,7 +54,7 @@ def counted(text: str) -> int:
 
 
 class Once(argparse.Action):
-    """Keeps the value of an option that may stand once: of two outputs or logs, argparse would drop the first."""
+    """Action that keeps the value of an option that may stand once; argparse would drop the first of two."""
 
     def __call__(
         self,
@@ -92,7 +92,7 @@ EXAMPLES: Mapping[str, str] = {
 
 
 def named(*suffixes: str) -> Callable[[str], Path]:
-    """Parser of the path of a file to write, whose name must end in one of `suffixes`."""
+    """Return a parser of the path of a file to write, whose name must end in one of `suffixes`."""
 
     def path(text: str) -> Path:
         if Path(text).suffix not in suffixes:
@@ -103,7 +103,7 @@ def named(*suffixes: str) -> Callable[[str], Path]:
 
 
 def command_line() -> argparse.ArgumentParser:
-    """Parser of the whole command line; `command` names the one to do."""
+    """Return the parser of the whole command line; `command` names the one to do."""
     parser = _Parser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
     parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -318,5 +318,5 @@ def command_line() -> argparse.ArgumentParser:
 
 
 def subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """The parser of each command by its name."""
+    """Return the parser of each command by its name."""
     return next(dict(a.choices) for a in parser._actions if isinstance(a, argparse._SubParsersAction))

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 
 class WorkError(Exception):
-    """The work could not be done; the text is one line for the user."""
+    """Error of work that could not be done; the text is one line for the user."""
 
 
 def configured(args: argparse.Namespace) -> Config:
-    """The configuration that --config and --set name, or soilbus.toml in the current folder."""
+    """Return the configuration that --config and --set name, or soilbus.toml in the current folder."""
     from soilbus.config.file import found_configuration, load_config
 
     config = load_config(found_configuration(args.config), args.set)
@@ -29,7 +29,7 @@ def configured(args: argparse.Namespace) -> Config:
 
 
 def configured_or_reference(args: argparse.Namespace) -> Config:
-    """The same, or that of our reference tractor where none is named."""
+    """Return the configuration that --config and --set name, or that of our reference tractor."""
     from soilbus.simulator.reference import reference_configuration
 
     return configured(args) if args.config else reference_configuration(args.set)
@@ -44,7 +44,7 @@ def need_extra(module: str, extra: str, what: str) -> None:
 
 
 def report(path: Path | None, record: Any, text: str) -> None:
-    """A record as JSON where --json says; the text, unless standard output is for the JSON."""
+    """Write a record as JSON where --json says, and print the text unless standard output is for the JSON."""
     if path is not None:
         write_text(path, json.dumps(record, indent=1) + "\n")
     if str(path) != "-":
@@ -53,7 +53,7 @@ def report(path: Path | None, record: Any, text: str) -> None:
 
 @contextmanager
 def reading_or_writing(path: Path) -> Iterator[None]:
-    """Say an error of a file in one line with its name."""
+    """Turn an error of a file into one line with its name."""
     try:
         yield
     except OSError as error:
@@ -63,7 +63,7 @@ def reading_or_writing(path: Path) -> Iterator[None]:
 
 
 def check_outputs(*written: Path | None, read: Iterable[Path] = ()) -> None:
-    """Long work asks first whether there is a folder for each file it writes, and that none is a file it reads."""
+    """Check before long work that each file to write has a folder, and is none that is read."""
     inputs, outputs = {os.path.realpath(path) for path in read}, set[str]()
     for path in written:
         if path is None:
@@ -81,7 +81,7 @@ def check_outputs(*written: Path | None, read: Iterable[Path] = ()) -> None:
 
 
 def check_log_to_write(path: Path | None) -> None:
-    """The same of a log: a format that can be written, in a folder that is there."""
+    """Check that a log to write has a known format, and a folder that is there."""
     from soilbus.can.log_writer import format_of
 
     if path is None:

@@ -10,13 +10,13 @@ PLACES = (PACKAGE, PACKAGE.parent, PACKAGE.parents[1])
 
 
 def pages() -> dict[str, Path]:
-    """File of each page by its name."""
+    """Return the file of each page by its name."""
     found = {path.stem: path for path in sorted(_folder("docs").glob("*.md"))}
     return found | {name: _folder(name) / "README.md" for name in ("dbc", "systemd")}
 
 
 def overview() -> str:
-    """Name and heading of each page, and where the files are, pictures among them."""
+    """Return name and heading of each page, and where the files are."""
     rows = [f"{name:16}{_heading(path)}\n" for name, path in pages().items()]
     return "".join(rows) + f"\nsoilbus docs PAGE prints one; they lie in {_folder('docs')}\n"
 

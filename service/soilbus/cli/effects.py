@@ -16,28 +16,28 @@ HEAD = ("parameter", "unit", "absent at", "prior std", "range")
 
 
 def parameter_rows(effect: Effect) -> list[tuple[str, ...]]:
-    """Each parameter of an effect: name, unit, value at which the effect is absent, prior std, range."""
+    """Return each parameter of an effect: name, unit, value at which the effect is absent, prior std, range."""
     return [
         (p.name, p.unit or "–", f"{p.neutral:g}", f"{p.std:g}", f"{p.low:g} to {p.high:g}") for p in effect.parameters
     ]
 
 
 def effect_text(effect: Effect) -> str:
-    """One effect in full."""
+    """Return one effect in full, as text."""
     parts = [f"{effect.name}\n", _wrapped(effect.physics), table(HEAD, parameter_rows(effect))]
     parts += [_wrapped(f"Shown by: {effect.tells}"), _wrapped(f"Source: {effect.source}")]
     return "\n".join(parts)
 
 
 def overview(effects: Iterable[Effect]) -> str:
-    """A row for each effect: name and physics."""
+    """Return a row for each effect: name and physics."""
     rows = [(effect.name, effect.physics.partition(": ")[0].rstrip(".")) for effect in effects]
     more = "\nsoilbus effects NAME: parameters, units, ranges, what tells it apart, source; --json OUT: all of them\n"
     return table(("effect", "physics"), rows) + more
 
 
 def effect_records(effects: Iterable[Effect]) -> list[dict[str, Any]]:
-    """All that the catalogue says of effects, for JSON."""
+    """Return all that the catalogue says of effects, for JSON."""
     return [
         {
             "name": effect.name,

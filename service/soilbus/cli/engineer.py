@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def replay(args: argparse.Namespace) -> None:
-    """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
+    """Run `soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
     with loading():
         from soilbus.can.dbc_files import load_databases
         from soilbus.config.model import ConfigError
@@ -217,7 +217,7 @@ def _source(args: argparse.Namespace, config: Config) -> Source:
 
 
 def simulate(args: argparse.Namespace) -> None:
-    """`soilbus simulate`: the simulated tractor, to a bus or a log."""
+    """Run `soilbus simulate`: the simulated tractor, to a bus or a log."""
     from soilbus.can.bus import BusError
     from soilbus.estimation.assembly import with_effects
     from soilbus.simulator.course import course
@@ -295,7 +295,7 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
 
 
 def effects(args: argparse.Namespace) -> None:
-    """`soilbus effects`: the catalogue."""
+    """Run `soilbus effects`: the catalogue."""
     from soilbus.cli.effects import effect_records, effect_text, overview
     from soilbus.config.model import ConfigError
     from soilbus.terra.effects.catalogue import CATALOGUE
@@ -308,7 +308,7 @@ def effects(args: argparse.Namespace) -> None:
 
 
 def diagnose(args: argparse.Namespace) -> None:
-    """`soilbus diagnose`: find, name, add, show, and say what to drive next."""
+    """Run `soilbus diagnose`: find, name, add, show, and say what to drive next."""
     import json
 
     from soilbus.config.edit import with_effects_text
@@ -356,7 +356,7 @@ def diagnose(args: argparse.Namespace) -> None:
 
 
 def batch(args: argparse.Namespace) -> None:
-    """`soilbus batch`: many logs, on all cores or on a Dask cluster."""
+    """Run `soilbus batch`: many logs, on all cores or on a Dask cluster."""
     from soilbus.config.file import found_configuration, load_config
 
     def own(path: Path) -> Config:

@@ -27,7 +27,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code."""
+    """Run one command and return its exit code."""
     args = command_line().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_StandardError()])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news

@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 from soilbus.cli.arguments import EXAMPLES, command_line, subcommands
 from soilbus.cli.effects import HEAD, parameter_rows
 from soilbus.config import model
-from soilbus.config.model import Column, Config, Noise, Prior, Signal
+from soilbus.config.model import Column, Config, Noise, Prior, RunningGear, Signal
 from soilbus.config.model import Effect as EffectTable
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
@@ -34,7 +34,7 @@ GENERATED = "<!-- generated: python -m soilbus.cli.reference service/docs -->\n\
 
 
 def pages() -> dict[str, str]:
-    """Text of each generated page by its file name."""
+    """Return the text of each generated page by its file name."""
     return {
         "configuration.md": configuration_page(),
         "commands.md": commands_page(),
@@ -43,16 +43,17 @@ def pages() -> dict[str, str]:
 
 
 def configuration_page() -> str:
-    """Every key of the TOML file with type, default and meaning, section by section."""
+    """Return every key of the TOML file with type, default and meaning, section by section."""
     text = (
         f"{GENERATED}# Configuration reference\n\nOne TOML file describes one vehicle. Values are SI; an unknown key"
-        " is an error. `soilbus check --config F` prints every setting in force. Any key can be overridden on the"
-        " command line by `--set KEY=VALUE` with its dotted path.\n"
+        " is an error. `soilbus check --config F --settings` prints every setting in force. `--set KEY=VALUE`"
+        " overrides a key by its dotted path.\n"
     )
-    for heading, section in (*_sections(Config, ""), *((value.__name__, value) for value in VALUES)):
-        rows = [_row(section, name, field) for name, field in section.model_fields.items()]
+    for heading, section in (*_sections(Config, ""), *((value.__name__, value) for value in (RunningGear, *VALUES))):
+        own = inspect.get_annotations(section)
+        rows = [_row(section, name, field) for name, field in section.model_fields.items() if name in own]
         text += f"\n## {heading}\n\n{inspect.getdoc(section)}\n\n| key | type | default | meaning |\n"
-        text += "| --- | --- | --- | --- |\n" + "".join(rows)
+        text += "| - | - | - | - |\n" + "".join(rows)
     return text
 
 
@@ -96,8 +97,8 @@ def _type(annotation: Any) -> str:
         return names[annotation]
     if type(None) in parts:
         return _type(parts[0])
-    if getattr(annotation, "__origin__", None) in (list, dict):
-        return f"list of {_type(parts[0])}" if annotation.__origin__ is list else "table"
+    if getattr(annotation, "__origin__", None) in (list, tuple, dict):
+        return "table" if annotation.__origin__ is dict else f"list of {_type(parts[0])}"
     if parts and all(isinstance(part, (str, int)) for part in parts):
         return " or ".join(f"`{part!r}`".replace("'", '"') for part in parts)
     return _type(parts[0]) if parts else str(annotation)
@@ -105,7 +106,7 @@ def _type(annotation: Any) -> str:
 
 def _value(default: Any) -> str:
     if default is None:
-        return "none"
+        return ""
     if isinstance(default, BaseModel):
         kept = {k: v for k, v in default.model_dump().items() if v not in (0.0, None)}
         return "`{ " + ", ".join(f"{k} = {_toml(v)}" for k, v in kept.items()) + " }`" if kept else "`{}`"
@@ -113,6 +114,10 @@ def _value(default: Any) -> str:
 
 
 def _toml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
     return f'"{value}"' if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -130,19 +135,19 @@ def _attribute_docs(section: type[BaseModel]) -> dict[str, str]:
 
 
 def commands_page() -> str:
-    """The help of every command."""
+    """Return the help of every command."""
     text = (
         f"{GENERATED}# Commands\n\nExit codes: 0 done; 1 the work could not be done (one line on stderr); 2 wrong usage"
-        " or configuration. `--set KEY=VALUE` (dotted path, as in `--set soil.c.value=5000` or"
-        " `--set wheel.FL.radius=0.51`) overrides a value of the configuration in any command that takes `--config`."
-        " Without `--config` it is `soilbus.toml` in the current folder; `tractor`, `tractor-2wd` and `tractor-axles`"
-        " name reference machines. An output file is there whole or not at all; workers end with the command. \n\nLogs"
-        " are recognised by content, whatever their name: candump (`-L`, or its console output with stamps), SavvyCAN"
-        " (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite of python-can;"
-        " plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as UTC. Of a log with"
-        " several channels `bus.channel` is read, or `--channel`; the others are counted and said. `canN` is also the"
-        " channel numbered N + 1, or N in a log whose numbers begin at 0; a log of one other channel is read, with a"
-        " line that says so.\n\n"
+        " or configuration. An output file is there whole or not at all; workers end with the command.\n\n"
+        "`--config FILE` names the configuration, or a reference machine: `tractor`, `tractor-2wd`, `tractor-axles`."
+        " `--set KEY=VALUE` overrides a value by its dotted path, as in `--set soil.c.value=5000` or"
+        " `--set wheel.FL.radius=0.51`. Commands that take both say so, with the configuration that they take"
+        " otherwise.\n\nLogs are recognised by content, whatever their name: candump (`-L`, or its console output with"
+        " stamps), SavvyCAN (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite"
+        " of python-can; plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as"
+        " UTC. Of a log with several channels `bus.channel` is read, or `--channel`; the others are counted and said."
+        " `canN` is also the channel numbered N + 1, or N in a log whose numbers begin at 0; a log of one other channel"
+        " is read, with a line that says so.\n\n"
         "MF4 needs the extra `mf4`, zstd `tables`, `--report` `plots`, `bench` `peers`, `completion` the extra of its"
         " name.\n"
     )
@@ -153,18 +158,21 @@ def commands_page() -> str:
 
 
 def _arguments(command: argparse.ArgumentParser) -> str:
-    rows = []
+    rows, taken = [], ""
     for action in command._actions:
-        if isinstance(action, argparse._HelpAction):
+        if isinstance(action, argparse._HelpAction) or action.dest == "set":
+            continue
+        if action.dest == "config":
+            taken = f"Takes `--config` (default: {(action.help or '').rpartition('default: ')[2]}) and `--set`.\n\n"
             continue
         metavar = action.metavar if isinstance(action.metavar, str) else " ".join(action.metavar or ())
         shown = f"{', '.join(action.option_strings)} {metavar}".strip() or action.dest
         rows.append(f"| `{shown}`{' (required)' if action.required else ''} | {action.help or ''} |\n")
-    return "| argument | meaning |\n| --- | --- |\n" + "".join(rows) if rows else ""
+    return taken + ("| argument | meaning |\n| - | - |\n" + "".join(rows) if rows else "")
 
 
 def effects_page() -> str:
-    """The catalogue of effects: physics, parameters with unit, neutral value and range, source, what shows it."""
+    """Return the catalogue of effects: physics, parameters with unit and range, source, what shows it."""
     text = (
         f"{GENERATED}# Effects\n\nWhat can be added to the wheel–soil model, to the balance of the vehicle or to a"
         " sensor: by `soilbus diagnose`, by `[model] effects` of a configuration, or by `soilbus simulate --effect"
@@ -174,10 +182,13 @@ def effects_page() -> str:
 
 
 def _effect(effect: Effect) -> str:
-    rows = ([f"`{name}`", *others] for name, *others in parameter_rows(effect))
+    alike: dict[tuple[str, ...], list[str]] = {}  # of a spline, say: one row for all its knots
+    for name, *others in parameter_rows(effect):
+        alike.setdefault((name.rstrip("0123456789"), *others), []).append(f"`{name}`")
+    rows = ([", ".join(names), *others] for (_, *others), names in alike.items())
     return (
         f"\n## {effect.name}\n\n{effect.physics}\n\n*Shown by:* {effect.tells}\n\n*Source:* {effect.source}\n\n"
-        + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["---"] * len(HEAD), *rows))
+        + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["-"] * len(HEAD), *rows))
     )
 
 

@@ -14,14 +14,14 @@ from soilbus.files import whole_file
 
 
 def paper(args: argparse.Namespace) -> None:
-    """`soilbus paper`: the tables of Xi et al. 2024 beside ours."""
+    """Run `soilbus paper`: the tables of Xi et al. 2024 beside ours."""
     from soilbus.trials.paper_report import paper_report
 
     print(paper_report(args.sinkage), end="")
 
 
 def decisions(args: argparse.Namespace) -> None:
-    """`soilbus decisions`: predictions beside what simulated drives then do."""
+    """Run `soilbus decisions`: predictions beside what simulated drives then do."""
     from soilbus.config.model import ConfigError
     from soilbus.simulator.drive import SimulationError
     from soilbus.trials.bogging_trials import warning_trials
@@ -44,7 +44,7 @@ def decisions(args: argparse.Namespace) -> None:
 
 
 def bench(args: argparse.Namespace) -> None:
-    """`soilbus bench`: performance figures beside their peers."""
+    """Run `soilbus bench`: performance figures beside their peers."""
     import json
 
     from soilbus.trials.bench import bench_report, run_bench

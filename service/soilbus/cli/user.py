@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def demo(args: argparse.Namespace) -> None:
-    """`soilbus demo`: simulated tractor, service and dashboard."""
+    """Run `soilbus demo`: simulated tractor, service and dashboard."""
     from soilbus.cli.demo import run_demo
 
     check_outputs(args.picture)
@@ -40,7 +40,7 @@ def demo(args: argparse.Namespace) -> None:
 
 
 def init(args: argparse.Namespace) -> None:
-    """`soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
+    """Run `soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
     from soilbus.can.dbc_files import load_databases
     from soilbus.can.logs import Log, LogError
     from soilbus.can.role_matching import assigned, candidates
@@ -106,7 +106,7 @@ def _of_table(path: Path) -> tuple[str, Database, SignalTable]:
 
 
 def run(args: argparse.Namespace) -> None:
-    """`soilbus run`: the daemon on a live bus."""
+    """Run `soilbus run`: the daemon on a live bus."""
     # python-can loads asammdf where it is installed: 2 s and 97 MB for files that the service never reads.
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """`soilbus check`: the configuration, and with a recording or a live bus the data beside it."""
+    """Run `soilbus check`: the configuration, and with a recording or a live bus the data beside it."""
     from soilbus.config.model import ConfigError
     from soilbus.report.configuration import (
         configuration_report,
@@ -209,7 +209,7 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 
 
 def watch(args: argparse.Namespace) -> None:
-    """`soilbus watch`: the dashboard of the live bus or of a recording."""
+    """Run `soilbus watch`: the dashboard of the live bus or of a recording."""
     from soilbus.can.bus import BusError
     from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError
@@ -231,7 +231,7 @@ def watch(args: argparse.Namespace) -> None:
 
 
 def completion(args: argparse.Namespace) -> None:
-    """`soilbus completion`: a shell's completion of commands, options and files."""
+    """Run `soilbus completion`: a shell's completion of commands, options and files."""
     need_extra("shtab", "completion", "completion")
     import shtab
 
@@ -246,7 +246,7 @@ def completion(args: argparse.Namespace) -> None:
 
 
 def docs(args: argparse.Namespace) -> None:
-    """`soilbus docs`: the pages that came with this version."""
+    """Run `soilbus docs`: the pages that came with this version."""
     from soilbus.cli.docs import overview, pages
     from soilbus.config.model import ConfigError
     from soilbus.words import did_you_mean

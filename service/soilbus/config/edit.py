@@ -21,7 +21,7 @@ EffectTable = Mapping[str, Any]
 def with_effects_text(
     path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Sequence[str] = ()
 ) -> str:
-    """The text of a configuration file with overrides in force and other effects.
+    """Return the text of a configuration file with overrides in force and other effects.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def _from(place: Path, folder: Path, name: str) -> str:
 
 
 def named_from(place: Path, file: Path) -> str:
-    """How a configuration in a folder calls a DBC file: ours, or one beside it, by its name alone.
+    """Return the name by which a configuration in a folder calls a DBC file: ours, or one beside it.
 
     Raises ConfigError for a name that TOML cannot hold.
     """
@@ -92,6 +92,6 @@ def named_from(place: Path, file: Path) -> str:
 
 
 def toml_text(document: TOMLDocument) -> str:
-    """The text of a document whose comments are printable; in its texts, what is not stands as an escape of TOML."""
+    """Return the text of a document with unprintable characters as escapes of TOML."""
     lines = tomlkit.dumps(document).split("\n")
     return "\n".join("".join(c if c.isprintable() else f"\\U{ord(c):08X}" for c in line) for line in lines)

@@ -22,12 +22,12 @@ MAX_SHOWN_CHARACTERS = 40
 
 
 def fault_lines(raw: Mapping[str, Any], error: ValidationError) -> list[str]:
-    """One line for each fault: the dotted key, wheels and effects by name, and what is wrong."""
+    """Return one line for each fault: the dotted key, wheels and effects by name, and what is wrong."""
     return [line for e in error.errors(include_url=False) for line in _lines(raw, e)]
 
 
 def open_lines(raw: Mapping[str, Any]) -> list[str]:
-    """One line for each open value: its dotted key and what belongs there."""
+    """Return one line for each open value: its dotted key and what belongs there."""
 
     def walk(here: Any, location: tuple[Any, ...]) -> Iterator[str]:
         if here == OPEN:

@@ -65,12 +65,12 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
 
 
 def machine(name: str) -> Path:
-    """Configuration of a reference machine: tractor, tractor-2wd, tractor-axles."""
+    """Return the configuration of a reference machine: tractor, tractor-2wd, tractor-axles."""
     return MACHINES / f"{name}.toml"
 
 
 def found_configuration(name: str | None) -> Path:
-    """The file that a command's --config means.
+    """Return the file that a command's --config means.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str =
 
 
 def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    """The nested mappings, changed in place by KEY=VALUE overrides; ConfigError for one that cannot be."""
+    """Change the nested mappings in place by KEY=VALUE overrides, and return them; ConfigError for a wrong one."""
     for text in overrides:
         _override(raw, text)
     return raw
@@ -169,7 +169,7 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
 
 
 def shipped_dbc(name: str) -> Path:
-    """Path of a DBC file that comes with soilbus: in a checkout's dbc/ or the installed package.
+    """Return the path of a DBC file that comes with soilbus: in a checkout's dbc/ or the installed package.
 
     Raises FileNotFoundError when there is none of that name.
     """
@@ -181,7 +181,7 @@ def shipped_dbc(name: str) -> Path:
 
 
 def located(folder: Path, name: str) -> Path:
-    """Path of the DBC file that a configuration in this folder calls so: beside it, or ours by name."""
+    """Return the path of the DBC file that a configuration in this folder names: beside it, or ours."""
     beside = folder / name
     if beside.is_file():
         return beside

@@ -48,6 +48,7 @@ __all__ = [
     "NoiseOfChannels",
     "Output",
     "Prior",
+    "RunningGear",
     "Signal",
     "Signals",
     "SoilPrior",
@@ -78,7 +79,7 @@ SignalName = Annotated[str, Field(min_length=1), AfterValidator(_signal_name)]
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; `faults` holds one line for each fault, without line breaks of names."""
+    """Error of a configuration that cannot be used; `faults` holds one line for each fault."""
 
     def __init__(self, faults: Iterable[str]) -> None:
         self.faults = [shown(fault) for fault in faults]
@@ -87,7 +88,7 @@ class ConfigError(Exception):
 
 @dataclass(frozen=True)
 class Usual:
-    """From the least to the greatest value that a real machine has; what lies outside is a slip of the pen.
+    """Range of values that real machines have; a value outside is a slip of the pen.
 
     `slips` are units in which the quantity is often written by mistake, with their SI value:
     the one that makes the most ordinary value of it is named.
@@ -150,7 +151,7 @@ class _Section(BaseModel):
 
 
 class Bus(BaseModel):
-    """Handed to python-can; keys that are not ours go to the interface as they are."""
+    """Interface of python-can; keys that are not ours go to it as they are."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     interface: str = "socketcan"
@@ -172,11 +173,11 @@ class Dbc(_Section):
     input: list[str] = Field(default_factory=list)
     """Files that hold the mapped messages."""
     checked: list[str] = Field(default_factory=list)
-    """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
+    """Messages of the vehicle's own DBC that count only with a right Counter and Checksum (dbc/README.md)."""
 
 
 class Signal(_Section):
-    """Where a role's value comes from: "Message.Signal", or a table with more to say."""
+    """Source of a role's value: "Message.Signal", or a table with more keys."""
 
     signal: SignalName
     """`Message.Signal` of the DBC; with [columns] the name of a column."""
@@ -191,16 +192,15 @@ class Signal(_Section):
     timeout: PositiveFloat | None = None
     """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
-    """How much earlier what a sample reports was true [s]: a radar's filter, a receiver's solution, a queue."""
+    """Time [s] by which a sample is late: a radar's filter, a receiver's solution, a queue."""
     torque_constant: PositiveFloat | None = None
     """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
     reference_torque: PositiveFloat | None = None
-    """Torque of 100 % [N m], where a percentage of it is mapped: in J1939 SPN 513, of the engine's reference torque,
-    SPN 544."""
+    """Torque of 100 % [N m], where a percentage is mapped: in J1939 SPN 544, of which SPN 513 is the percentage."""
     effective_area: Annotated[PositiveFloat, AfterValidator(SPRING_AREA)] | None = None
-    """Of an axle's air springs together [m^2], where their pressure is mapped to its load: force over pressure."""
+    """Force over pressure of an axle's air springs together [m^2], where their pressure is mapped to its load."""
     unsprung_mass: NonNegativeFloat = 0.0
-    """What the air springs do not carry [kg]: axle and wheels; added to the load that their pressure gives."""
+    """Mass that the air springs do not carry [kg]: axle and wheels."""
     unit: str | None = None
     """Unit of a column's values, where its name does not end in one."""
 
@@ -230,15 +230,15 @@ class Vehicle(_Section):
     mass: Annotated[PositiveFloat, AfterValidator(MASS)]
     """Of the whole vehicle [kg], ballast included; `{ value, std }` where tanks, driver or load change it."""
     mass_std: Annotated[NonNegativeFloat, AfterValidator(MASS_STD)] | None = None
-    """Its standard deviation [kg], which `mass = { value, std }` sets; by default 2 % of the mass where a load is not
-    measured (driver, half a tank), else 0."""
+    """Its std [kg], which `mass = { value, std }` sets; by default 2 % of the mass (driver, half a tank) where a load
+    is not measured, else 0."""
     wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
     """First to last axle [m]."""
     cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
     """Centre of gravity ahead of the rear axle [m]; `{ value, std }` where it is not known well."""
     cg_std: Annotated[NonNegativeFloat, AfterValidator(LENGTH_STD)] | None = None
-    """Its standard deviation [m], which `cg_ahead_of_rear_axle = { value, std }` sets; by default 2 % of the wheelbase
-    where a load is not measured, else 0."""
+    """Its std [m], which `cg_ahead_of_rear_axle = { value, std }` sets; by default 2 % of the wheelbase where a load is
+    not measured, else 0."""
     cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
     """Centre of gravity above the ground [m]."""
     hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
@@ -246,10 +246,10 @@ class Vehicle(_Section):
     track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
     """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
     towing: Literal["measured", "never", "unknown"] = "measured"
-    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows in full:
-    `signals.draft` is not used then, and there is no GO."""
+    """Draft at the hitch: measured by `signals.draft`, never any, or unknown, which no sensor shows in full: then
+    `signals.draft` is not used and there is no GO."""
     steering: Literal["wheels", "skid"] = "wheels"
-    """By turned wheels, or by the speeds of the two sides, which lets the wheels slide sideways in every turn."""
+    """By turned wheels, or by the speeds of the two sides: then wheels slide sideways in every turn."""
     differential_lock: Signal | None = None
     """Above 0.5 while the differentials are locked; optional."""
 
@@ -282,14 +282,14 @@ class Vehicle(_Section):
 
 
 class SignalOfAcceleration(Signal):
-    """An accelerometer along the vehicle; `kind` says what it measures."""
+    """An accelerometer along the vehicle, with the keys of a Signal; `kind` says what it measures."""
 
     kind: Literal["kinematic", "specific_force"] = "kinematic"
     """dv/dt, or the specific force dv/dt + g sin(pitch) that an inertial sensor fixed to the vehicle feels."""
 
 
 class Axle(_Section):
-    """What belongs to an axle and not to a wheel: its motor, its differential, a load cell or air spring.
+    """Motor, differential, load cell or air spring of an axle.
 
     Axles stand in the order of their tables, from the front to the rear; `front` is always the first and `rear` the
     last.  `both` is the shaft that drives all axles; its differentials are those between the axles.  Torques are of the
@@ -301,13 +301,13 @@ class Axle(_Section):
     ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(WHEELBASE)] | None = None
     """Distance [m] of an axle between the first and the last from the last; without, all are equally far apart."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
-    """Turns of the shaft for one of the axle's wheels; of `both`: of its motor for one of the shafts to the axles,
-    whose own ratios are those of `front` and `rear`."""
+    """Turns of the motor for one of the axle's wheels; of `both`: for one of the shafts to the axles, whose own ratios
+    are those of `front` and `rear`."""
     differential: Literal["open", "locked", "limited"] = "open"
     """Open: the same torque left and right.  Locked: the same speed.  Limited: in between."""
     torque_bias: Annotated[NonNegativeFloat, AfterValidator(SHARE)] | None = None
-    """Sd of the difference of the two torques over their sum; by default 0.05 of an open differential (its friction:
-    bias ratio 1.1), 0.25 of one of limited slip (bias ratios of 2 to 3; Wong 2008, sect. 4.4)."""
+    """Sd of the difference of the two torques over their sum; by default 0.05 of an open differential (bias ratio 1.1),
+    0.25 of limited slip (bias ratios of 2 to 3; Wong 2008, sect. 4.4)."""
     max_torque: Annotated[PositiveFloat, AfterValidator(AXLE_TORQUE)] | None = None
     """Greatest torque at the axle [N m], where no signal reports it."""
     torque: Signal | None = None
@@ -320,19 +320,9 @@ class Axle(_Section):
     """Load on the axle [N]: load cell, or with `effective_area` the pressure of the air springs."""
 
 
-class Wheel(_Section):
-    """One wheel and its sensors; only the wheel of a test rig has no axle, and of an axle the left one stands first."""
+class RunningGear(_Section):
+    """Motor and sensors of a wheel, or of a track: "wheel" is then its sprocket."""
 
-    name: Name
-    """For messages, JSON and frames: FL, FR, RL, RR on a tractor, ML and MR between them on six wheels."""
-    axle: Name | None = None
-    """Axle that carries it: `front`, `middle`, `rear`, or the name of an [[axle]]."""
-    radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
-    """Rolling radius [m]."""
-    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
-    """Of the tyre [m]."""
-    tyre: Literal["flexible", "rigid"] = "flexible"
-    """A rigid wheel has no tyre that could flatten or wear."""
     driven: bool = True
     """false: it rolls freely, without any torque but the drag of its bearing."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
@@ -344,24 +334,42 @@ class Wheel(_Section):
     speed: Signal | None = None
     """Rotation [rad/s], at the wheel or the shaft."""
     load: Signal | None = None
-    """Load cell [N]."""
+    """Load cell [N]; without, the load follows from the vehicle's weight."""
     sinkage: Signal | None = None
-    """Depth of the rut below the wheel [m]; optional."""
+    """Depth of the rut [m]; optional."""
     torque_limit: Signal | None = None
     """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
     """Only to find a faulty speed sensor."""
 
+
+class Wheel(RunningGear):
+    """One wheel, with the keys of a RunningGear.
+
+    Only the wheel of a test rig has no axle; of an axle the left one stands first.
+    """
+
+    name: Name
+    """For messages, JSON and frames: FL, FR, RL, RR on a tractor, ML and MR between them on six wheels."""
+    axle: Name | None = None
+    """Axle that carries it: `front`, `middle`, `rear`, or the name of an [[axle]]."""
+    radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
+    """Rolling radius [m]."""
+    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    """Of the tyre [m]."""
+    tyre: Literal["flexible", "rigid"] = "flexible"
+    """A rigid wheel has no tyre that could flatten or wear."""
+
     _contact_length: float = PrivateAttr(0.0)
 
     @property
     def contact_length(self) -> float:
-        """Of a track on the ground [m]; 0 of a wheel."""
+        """Contact length of a track on the ground [m]; 0 of a wheel."""
         return self._contact_length
 
     @property
     def section(self) -> str:
-        """Of the TOML file that describes it."""
+        """Section of the TOML file that describes it."""
         return "track" if self._contact_length else "wheel"
 
     @model_validator(mode="after")
@@ -377,11 +385,12 @@ def _check_free(part: Wheel | Track, section: str) -> None:
         raise ValueError(f"{section} {part.name} has driven = false and a {of_motor[0]}: leave out one of the two")
 
 
-class Track(_Section):
-    """One track and its sensors, the left one first; its pressure on the ground is uniform, or peaks below its rollers.
+class Track(RunningGear):
+    """One track, the left one first, with the keys of a RunningGear.
 
-    Tracks alone carry the whole vehicle: its `wheelbase` is then their contact length, and it steers by `skid`, unless
-    [vehicle] says otherwise.  With wheels, or on both axles, a track takes the place of the wheel of its axle.
+    Pressure on the ground is uniform, or peaks below its rollers.  Tracks alone carry the whole vehicle: its
+    `wheelbase` is then their contact length, and it steers by `skid`, unless [vehicle] says otherwise.  With wheels, or
+    on both axles, a track takes the place of the wheel of its axle.
     """
 
     name: Name
@@ -399,29 +408,11 @@ class Track(_Section):
     sprocket_teeth: PositiveInt | None = None
     """Links that one turn of the sprocket moves."""
     roller_spacing: Annotated[PositiveFloat, AfterValidator(WIDTH)] | None = None
-    """From one road roller to the next [m], where pressure peaks below each: p (1 + cos(2 pi x / spacing)), as below
-    short links and rollers far apart (Wills 1963).  Without, pressure is uniform."""
-    driven: bool = True
-    """false: no motor drives it."""
-    gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
-    """Turns of the motor shaft for one of the sprocket."""
-    max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
-    """The motor's limit at the sprocket [N m], where no signal reports it."""
-    torque: Signal | None = None
-    """Motor torque [N m], at the sprocket ("wheel") or the shaft."""
-    speed: Signal | None = None
-    """Rotation [rad/s], at the sprocket ("wheel") or the shaft."""
-    load: Signal | None = None
-    """Load cell [N]; without, the load follows from the vehicle's weight."""
-    sinkage: Signal | None = None
-    """Depth of the rut [m]; optional."""
-    torque_limit: Signal | None = None
-    """Greatest torque that the motor reports it can give [N m]; optional."""
-    motor_speed: Signal | None = None
-    """Only to find a faulty speed sensor."""
+    """From one road roller to the next [m], where pressure peaks below each by p (1 + cos(2 pi x / spacing)) (Wills
+    1963).  Without, pressure is uniform."""
 
     def as_wheel(self) -> Wheel:
-        """The rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
+        """Return the rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
         same = {key: getattr(self, key) for key in type(self).model_fields if key in Wheel.model_fields}
         wheel = Wheel(**same | {"axle": self.axle or "front"}, radius=self.radius, tyre="rigid")
         wheel._contact_length = self.contact_length
@@ -606,10 +597,9 @@ class NoiseOfChannels(_Section):
     steering_angle: Noise = Noise(absolute=0.02)
     """[rad]."""
     computed_load: Noise = Noise(relative=0.12, gain=0.02)
-    """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
-    rms of what bouncing, pitching and rolling on uneven ground add to a wheel's load, over it, and the fixed error of
-    the share left and right.  Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (the field
-    vehicle's: 12 %)."""
+    """Load that no cell measures: rms of what uneven ground adds to a wheel's load, over it, and the fixed error of the
+    share left and right.  What mass, centre of gravity, pitch, acceleration and draft leave open comes besides.
+    Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (the field vehicle's: 12 %)."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
@@ -621,7 +611,7 @@ class NoiseOfChannels(_Section):
         return noise
 
     def scaled(self, factor: float, *parts: str) -> NoiseOfChannels:
-        """With these parts (by default all) of each channel's noise times a factor, which may be 0."""
+        """Return the noise with these parts (by default all) of each channel times a factor, which may be 0."""
         noises = {name: getattr(self, name) for name in type(self).model_fields}
         return self.model_copy(update={
             name: noise.model_copy(update={part: factor * getattr(noise, part) for part in parts or Noise.model_fields})
@@ -630,7 +620,7 @@ class NoiseOfChannels(_Section):
 
 
 class Prior(_Section):
-    """What is known of a soil parameter beforehand; std = 0 holds it at value."""
+    """Prior of a soil parameter; std = 0 holds it at value."""
 
     value: NonNegativeFloat
     """Median of the prior."""
@@ -703,41 +693,40 @@ class Estimator(_Section):
     soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
-    """Samples are averaged over bins of this length, which the watch follows and the fit averages over 0.25 s; by
-    default 0.04 s where wheels share a torque behind an open or limited differential.  There the lighter wheel slips
-    more, at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque: with loads that shake by 12 %, 73 to 87 % of
-    the intervals of n hold with 0.1 s, 87 to 100 % with 0.04 s (`python -m tests.lab.computed_loads`)."""
+    """Samples are averaged over bins of this length [s].  The watch follows bins, the fit averages them over 0.25 s.
+    By default 0.04 s where wheels share a torque behind an open or limited differential: there slip changes with the
+    load at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque (`python -m tests.lab.computed_loads`)."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
     """Relative difference of speeds left and right in a turn above which slip is not judged (turn gate)."""
     max_lateral: PositiveFloat = 0.3
-    """Of a vehicle that steers by skidding: lateral over longitudinal sliding speed of its wheels above which slip is
+    """Lateral over longitudinal sliding speed of the wheels of a vehicle that steers by skidding, above which slip is
     not judged; at 0.3 the shear along the wheel is 4 % less than all of it."""
     z_ref: PositiveFloat = 0.02
     """Depth of the reported bearing pressure [m]."""
     b_ref: PositiveFloat = 0.3
     """Plate width of the reported bearing pressure [m]."""
     max_bearing_std: PositiveFloat = 0.10
-    """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
-    that carries load."""
+    """Relative std of the bearing pressure up to which a window is valid; at z_ref, or the nearest depth that carries
+    load."""
     max_draft_std: PositiveFloat = 0.25
-    """Std of the largest draft up to which a window of a vehicle counts as excited, as a share of this draft's size or,
-    where that is more, of a tenth of the weight."""
+    """Std of the largest draft up to which a window of a vehicle is valid, as a share of this draft, or of a tenth of
+    the weight where that is more."""
     max_tan_phi_std: PositiveFloat = 0.15
-    """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
-    of a test rig counts as excited, and up to which a window shows the soil's strength to the warning."""
+    """Relative std of tan phi, or of the strength c + p tan phi at the contact's pressure p, up to which a window of a
+    test rig is valid, and up to which the warning uses the soil's strength."""
     max_prediction_error: PositiveFloat = 0.25
-    """Error of the torque or pull that the model predicts for data it has not seen, as a share of what is there, above
-    which a window is `model_mismatch`."""
+    """Error of the torque or pull that the model predicts for unseen data, as a share of them, above which a window is
+    `model_mismatch`."""
     max_gain_error: PositiveFloat = 6.0
-    """Gain error of a sensor, in sd of what is configured of it, above which a window is `model_mismatch`: sound
-    multibody drives end at 5.3, those with a wrong weight or draft reach 9 to 20."""
+    """Gain error of a sensor, in sd of its configured gain, above which a window is `model_mismatch`: sound multibody
+    drives end at 5.3, those with a wrong weight or draft reach 9 to 20."""
     search_rate: NonNegativeFloat = 4.0
-    """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
-    the model describes take 1 to 3 in all (field and simulated drives)."""
+    """Evaluations of the model on a whole window that a search for another soil may take in each window.  Windows that
+    the model describes take 1 to 3 in all."""
     search_burst: PositiveFloat = 100.0
-    """Most of these that are kept for later: three times what searches at nine of ten starts and borders take (34)."""
+    """Evaluations that are kept for later at most: three times what nine of ten searches at starts and borders take."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:
@@ -747,7 +736,7 @@ class Estimator(_Section):
 
 
 class Traversability(_Section):
-    """When soilbus says go; draft N, slopes rad."""
+    """Thresholds of go and no_go; draft N, slopes rad."""
 
     max_slip: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.6
     """Slip that no driven wheel may pass; the largest draft is sought up to it."""
@@ -764,23 +753,23 @@ class Traversability(_Section):
     hold: PositiveInt = 2
     """Windows in a row that must speak for a better state."""
     max_age: PositiveFloat = 3.0
-    """Seconds after the last instant that it rests on from which a posterior no longer supports go."""
+    """Age [s] of its last instant from which a posterior no longer supports go."""
     min_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.15
     """Share of a window that must be measured on the present ground: since it changed, since a wheel last spun."""
     spin_time: PositiveFloat = 0.4
-    """Seconds for which a wheel beyond max_slip, or thrust that moves nothing, ends go: with means over 0.3 s and a
-    look every 0.1 s, within one second."""
+    """Time [s] for which a wheel beyond max_slip, or thrust that moves nothing, ends go: by means over 0.3 s within one
+    second."""
     stuck_time: PositiveFloat = 1.2
-    """Seconds for which a vehicle makes no way under thrust from which it is stuck; no start takes as long to show."""
+    """Time [s] without way under thrust from which a vehicle is stuck; no start takes as long to show."""
     standstill: PositiveFloat = 0.05
-    """Rim speed [m/s] below which a wheel does not turn: two impulses a second of a ring of 100 teeth at 0.5 m."""
+    """Rim speed [m/s] below which a wheel does not turn: two impulses a second of 100 teeth at 0.5 m."""
     stall_resistance: PositiveFloat = 0.15
     """Thrust beyond draft, slope and inertia, as a share of the weight, from which a vehicle whose wheels do not turn
-    stalls: more than an idling drive gives, less than wheels of any size need on loam (0.2 by this model)."""
+    stalls: more than an idling drive gives, less than wheels need on loam (0.2)."""
     contradiction: PositiveFloat = 3.0
-    """Standard deviations by which the wheels must pull less at their present slip than predicted for it to count."""
+    """Standard deviations by which wheels that pull less than predicted at their slip contradict the estimate."""
     full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
-    """Share of its torque limit from which a motor gives all it can: ripple and gain error of a torque sensor."""
+    """Share of its torque limit from which a motor gives all it can: ripple and gain error of its sensor."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Traversability:
@@ -790,20 +779,20 @@ class Traversability(_Section):
 
 
 class Warning(_Section):
-    """When soilbus warns of immobilisation from slip and speed alone, without any estimate of the soil.
+    """Warning of immobilisation from slip and speed alone, without any estimate of the soil.
 
-    Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
-    thesis, 2023, ch. 7), with eleven others looked at: `python -m tests.lab.snow`.
+    Tuned on six measured immobilisations of a 90 kg rover on snow (A. Lines, PhD thesis, 2023, ch. 7), with eleven
+    others looked at: `python -m tests.lab.snow`.
     """
 
     slip_horizon: PositiveFloat = 1.0
-    """Slip that is to pass `traversability.max_slip` within this time [s] is a cause."""
+    """Slip that is to pass `traversability.max_slip` within this time [s] warns."""
     stop_horizon: PositiveFloat = 1.5
-    """A vehicle that is to stand within this time [s], while thrust holds and wheels slip, is a cause."""
+    """A vehicle that is to stand within this time [s], while thrust holds and wheels slip, warns."""
     steady_horizon: PositiveFloat = 3.0
-    """The same by the steady trend of its speed."""
+    """The same time [s] by the steady trend of its speed."""
     probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.7
-    """Of either, from which it counts."""
+    """Probability of either from which it warns."""
     least_slip: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.25
     """Slip below which a vehicle that loses speed is only slowed down."""
     least_thrust: NonNegativeFloat = 0.03
@@ -839,7 +828,7 @@ class Effect(BaseModel):
 
 
 class Form(_Section):
-    """How far the contact of wheel and soil may differ in form from the model, at most; 0: not at all.
+    """Largest difference in form between the contact of wheel and soil and the model; 0: none.
 
     The greatest stress sits at (c1 + c2 s) of the entry angle, where the model has 0.5: c1 is 0.18 in loose and
     0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81).  Every form from the model's to
@@ -853,7 +842,7 @@ class Form(_Section):
     exit: NonNegativeFloat = 0.17
     """How large the exit angle behind the axle may be, over the entry angle: a rut that springs back by 3 %."""
     shear: NonNegativeFloat = 1.0
-    """Share of the strength that the other shear law may mobilise: all of it or none, one as likely as the other."""
+    """Share of the strength that the other shear law may mobilise: all of it or none, equally likely."""
 
 
 class Model(_Section):
@@ -867,14 +856,14 @@ class Model(_Section):
 
 
 class Output(_Section):
-    """What soilbus sends."""
+    """Layout of our frames, and classes of the soil map."""
 
     dbc: str = "soilbus.dbc"
     """Layout of our own frames."""
     compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(default=(5.0e4, 1.0e5, 2.0e5), strict=False)
-    """Bearing pressures [Pa] from which the soil counts as slightly compacted, compacted, very compacted: codes 2, 3, 4
-    of DDI 470 in `replay --isoxml`.  A tyre presses on soft ground about as hard as it is inflated (Wong 2008, ch. 2):
-    from 0.5, 1, 2 bar on the ground carries a tyre of that pressure with a rut of at most `estimator.z_ref`."""
+    """Bearing pressures [Pa] from which soil is slightly compacted, compacted, very compacted: codes 2, 3, 4 of DDI 470
+    in `replay --isoxml`.  Such ground carries a tyre inflated to 0.5, 1, 2 bar with a rut of at most `estimator.z_ref`
+    (Wong 2008, ch. 2)."""
 
     @field_validator("compaction")
     @classmethod
@@ -887,7 +876,7 @@ class Output(_Section):
 class J1939(_Section):
     """Our source address and NAME (SAE J1939-81, ISO 11783-5); the claim concerns `soilbus run` only.
 
-    Without the claim frames carry the address of the DBC.  With it nothing is sent before the address is claimed, nor
+    Without a claim frames carry the address of the DBC.  With one nothing is sent before the address is claimed, nor
     after a node with a smaller NAME has taken it.
     """
 
@@ -1108,11 +1097,11 @@ class Config(_Section):
         return self
 
     def axle_named(self, name: str | None) -> Axle | None:
-        """The [[axle]] of this name; None without."""
+        """Return the [[axle]] of this name; None without."""
         return next((axle for axle in self.axle if axle.name == name), None)
 
     def same_signal(self, role: str) -> list[list[Wheel]]:
-        """The wheels that have a role (torque, speed, load), those on one and the same signal together."""
+        """Return the wheels that have a role (torque, speed, load), those on the same signal together."""
         mapped = [wheel for wheel in self.wheel if getattr(wheel, role) is not None]
         return list(grouped(mapped, lambda wheel: getattr(wheel, role).signal).values())
 

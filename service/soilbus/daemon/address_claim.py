@@ -25,7 +25,7 @@ ADDRESS_CLAIMED, REQUEST = 60928, 59904
 
 
 class AddressClaim:
-    """Keeps one address.
+    """Claim of one source address (SAE J1939-81).
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class AddressClaim:
         self.begin()
 
     def begin(self) -> None:
-        """Claim, at the start and whenever the bus has come back."""
+        """Claim the address, at the start and whenever the bus has come back."""
         from j1939 import ControllerApplication, ElectronicControlUnit, Name
 
         self.close()
@@ -77,7 +77,7 @@ class AddressClaim:
             self._unit.notify(identifier, data, t)
 
     def outgoing(self) -> Iterator[Frame]:
-        """The claim's own frames that are due."""
+        """Yield the claim's own frames that are due."""
         while self._outgoing:
             yield self._outgoing.popleft()
 
@@ -96,11 +96,11 @@ class AddressClaim:
         return lost
 
     def status(self) -> str:
-        """What is not well, for the status line; empty where the address is ours."""
+        """Return what is not well, for the status line; empty where the address is ours."""
         return "" if self.holds else self.status_of(self.is_lost)
 
     def status_of(self, lost: bool) -> str:
-        """Why nothing may be sent."""
+        """Return why nothing may be sent."""
         return f"address {self.wanted:#04x} " + ("belongs to a node with a smaller NAME" if lost else "not claimed yet")
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ _WORDS = {
 
 
 def health_frame(state: BusState, counts: BusCounts) -> tuple[str, dict[str, Any]]:
-    """Message name and values of the frame BusHealth.
+    """Return message name and values of the frame BusHealth.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def health_frame(state: BusState, counts: BusCounts) -> tuple[str, dict[str, Any
 
 
 def health_text(state: BusState, counts: BusCounts) -> str:
-    """What is not as it should be, such as "3 error frames, controller error_passive"; nothing if all is well."""
+    """Return what is wrong, such as "3 error frames, controller error_passive"; nothing if all is well."""
     found = [f"{n} {words}" for name, words in _WORDS.items() if (n := getattr(counts, name))]
     if state not in (BusState.UNKNOWN, BusState.ACTIVE):
         found.append(f"controller {state}")

@@ -35,7 +35,7 @@ class BusTime:
         """Monotonic time at which a frame was taken last."""
 
     def set_ahead(self, stamp: float, now: float) -> bool:
-        """Whether a stamp shows that the stamping clock was set ahead since the last frame.
+        """Return whether a stamp shows that the stamping clock was set ahead since the last frame.
 
         Parameters
         ----------
@@ -56,20 +56,20 @@ class BusTime:
         self._nothing_left = now
 
     def at(self, now: float) -> float:
-        """Bus time [s] at the monotonic time `now` [s]; 0 before the first frame."""
+        """Return the bus time [s] at the monotonic time `now` [s]; 0 before the first frame."""
         return max(self._stamp, now + self._offset) if self.last_frame > 0.0 else 0.0
 
     def read_until(self, now: float) -> float:
-        """Bus time [s] up to which frames were taken: the last stamp where more may wait, else as `at`."""
+        """Return the bus time [s] up to which frames were taken: the last stamp where more may wait, else as `at`."""
         return self._stamp if self._nothing_left < self.last_frame else self.at(now)
 
     def present(self, now: float) -> float:
-        """Bus time [s] by the stamping clock itself where it can be read, else as `at`."""
+        """Return the bus time [s] by the stamping clock itself where it can be read, else as `at`."""
         stamping = self._bus.stamping_time()
         return self.at(now) if math.isnan(stamping) else stamping
 
     def heard(self, end: float, now: float) -> float:
-        """Bus time [s] up to which all frames were received.
+        """Return the bus time [s] up to which all frames were received.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class BusTime:
         return heard
 
     def wait(self, end: float, now: float, longest: float) -> float:
-        """Time [s] to wait for a frame: at most `longest`, and not beyond the receipt of the window's end."""
+        """Return the time [s] to wait for a frame: at most `longest`, and at most to the window's end."""
         if self.at(now) + longest + TAKING_DELAY < end:
             return longest
         left = end + STAMPED - self._bus.stamping_time()

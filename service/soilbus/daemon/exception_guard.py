@@ -29,7 +29,7 @@ FAILURES_TO_FAULT = 3
 
 
 class GuardedEstimator:
-    """Solves windows with an estimator and catches what it raises.
+    """Estimator whose exceptions are caught and counted.
 
     Parameters
     ----------

@@ -16,13 +16,13 @@ MAX_TIME_WITHOUT_SEND = 30.0
 
 
 class Health:
-    """Watches the estimator and the sender; times are monotonic [s]."""
+    """Watch of the estimator and the sender; times are monotonic [s]."""
 
     def __init__(self, now: float) -> None:
         self._sent, self._able = 0, now
 
     def fault(self, now: float, solving_since: float | None, hears: bool, sent: int) -> str | None:
-        """What has stopped working; called once a tick.
+        """Return what has stopped working; call it once a tick.
 
         Parameters
         ----------

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Notifier:
-    """Sends to systemd's notification socket; without one every call does nothing.
+    """Sender to systemd's notification socket; without one every call does nothing.
 
     Attributes
     ----------
@@ -30,24 +30,24 @@ class Notifier:
 
     @classmethod
     def from_environment(cls, environ: Mapping[str, str] = os.environ) -> Notifier:
-        """The notifier that NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID ask for."""
+        """Return the notifier that NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID ask for."""
         return cls(environ.get("NOTIFY_SOCKET") or None, _watchdog_interval(environ))
 
     def ready(self, status: str) -> None:
-        """Start-up is over; `status` as in `status`."""
+        """Tell systemd that the start-up is over; `status` as in `status`."""
         self._send("READY=1", _status(status))
 
     def status(self, text: str) -> None:
-        """State and reason for `systemctl status`, one line."""
+        """Tell state and reason for `systemctl status`, in one line."""
         self._send(_status(text))
 
     def watchdog(self) -> None:
-        """The working loop has made a round. Never call this from a thread that does no work."""
+        """Tell systemd that the loop has made a round; never call this from a thread that does no work."""
         if self.watchdog_interval is not None:
             self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """Shutting down."""
+        """Tell systemd that the service shuts down."""
         self._send("STOPPING=1")
 
     def _send(self, *fields: str) -> None:

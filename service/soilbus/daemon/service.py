@@ -68,7 +68,7 @@ FOREIGN_SENDER_HOLD_TIME = 3.0
 
 
 class Service:
-    """One vehicle on one bus.
+    """Service of one vehicle on one bus.
 
     Parameters
     ----------
@@ -161,12 +161,12 @@ class Service:
 
     @property
     def windows(self) -> int:
-        """Windows solved since the start."""
+        """Number of windows solved since the start."""
         return self._work_queue.solved
 
     @property
     def newest_posterior(self) -> Gaussian | None:
-        """Posterior that the next window's prior comes from, as the state file keeps it; None before there is one."""
+        """Posterior from which the next window's prior comes; None before there is one."""
         return self._guarded_estimator.newest
 
     @property
@@ -412,7 +412,7 @@ class Service:
         return None if self._reached <= self._interrupted else self.result
 
     def present_decision(self, now: float) -> Traversability:
-        """The present decision.
+        """Return the present decision.
 
         Parameters
         ----------
@@ -553,6 +553,6 @@ def _first_word(reason: str) -> str:
 
 
 def software_version() -> tuple[int, int, int]:
-    """The three numbers of the package's version."""
+    """Return the three numbers of the package's version."""
     major, minor, patch = (int(part) for part in __version__.split("."))
     return major, minor, patch

@@ -44,7 +44,7 @@ def start_service(
     on_window: Callable[[WindowResult], None] | None = None,
     rehearse: bool = True,
 ) -> Service:
-    """The service of a configuration, with its bus open.
+    """Return the service of a configuration, with its bus open.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ class StoredPrior(NamedTuple):
 
 
 class StatePersistence:
-    """Keeps one vehicle's state in a folder.
+    """Keeper of one vehicle's state in a folder.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class StatePersistence:
 
     @property
     def stored_prior(self) -> StoredPrior | None:
-        """Posterior of the last run; a gain correlation time old where the clock was set back, None without one."""
+        """Posterior of the last run and its age: gain_correlation_time if the clock was set back; None without one."""
         if self._previous is None or self._previous.gaussian is None:
             return None
         elapsed = self._wall() - self._previous.gaussian.at
@@ -84,7 +84,7 @@ class StatePersistence:
         )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:
-        """Have the state written if that is due; returns at once.
+        """Begin to write the state if that is due; return at once.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class StatePersistence:
             self._write(gaussian, counts())
 
     def close(self, gaussian: Gaussian | None, counts: Mapping[str, int]) -> None:
-        """Have the last state written; waits for it, but not long."""
+        """Write the last state; wait for it, but not long."""
         self._write(gaussian, counts)
         if self._writing is not None:
             wait([self._writing], MAX_LAST_WRITE_TIME)

@@ -44,11 +44,11 @@ _PHI = PARAMETERS.index("phi")
 
 
 class StateError(Exception):
-    """A stored state cannot be used; one line on why."""
+    """Error of a stored state that cannot be used; one line says why."""
 
 
 class OtherOwner(StateError):
-    """A stored state is sound, and another vehicle's or another configuration's."""
+    """Error of a sound state of another vehicle or configuration."""
 
 
 class _Model(BaseModel):
@@ -65,7 +65,7 @@ class StoredGaussian(_Model):
 
 
 class State(_Model):
-    """What is stored: time [s, Unix], number of starts, the Gaussian, counters since the first start."""
+    """State to be stored: time [s, Unix], number of starts, the Gaussian, counters since the first start."""
 
     at: NonNegativeFloat
     starts: PositiveInt
@@ -85,7 +85,7 @@ class _File(_Model):
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Whose state a file may hold: a digest of all that a posterior depends on, and the bounds of such a posterior.
+    """Owner of a state: a digest of all that a posterior depends on, and the bounds of such a posterior.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Owner:
 
     @classmethod
     def of(cls, config: Config, channels: Iterable[Channel], database: Database) -> Owner:
-        """The vehicle of a configuration, with the signals that its channels come from."""
+        """Return the owner for a configuration and the signals that its channels come from."""
         prior = prior_of(config)
         names, gain_std = gain_errors(rig_of(config), model_of(config), effects_and_parameters_of(config)[1])
         return cls(
@@ -116,7 +116,7 @@ class Owner:
 
 
 def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussian:
-    """The Gaussian as it is stored.
+    """Return a Gaussian in the form in which it is stored.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussi
 
 
 def gaussian_of(stored: StoredGaussian, owner: Owner) -> Gaussian:
-    """The Gaussian that was stored.
+    """Return the Gaussian that was stored.
 
     Raises
     ------
@@ -187,14 +187,14 @@ def _check_covariance(covariance: Array, std: Array) -> None:
 
 
 def dumped(state: State, owner: Owner) -> bytes:
-    """The file's content."""
+    """Return the content of a state's file."""
     content = state.model_dump()
     envelope = {"format": FORMAT, "version": VERSION, "key": owner.key, "checksum": digest(content), "state": content}
     return (json.dumps(envelope, allow_nan=False) + "\n").encode()
 
 
 def loaded(content: bytes, owner: Owner) -> State:
-    """The state in a file's content.
+    """Return the state in a file's content.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def loaded(content: bytes, owner: Owner) -> State:
 
 
 def read(path: Path, owner: Owner) -> State | None:
-    """The state in a file; None where there is no file.
+    """Return the state in a file; None where there is no file.
 
     Raises
     ------
@@ -254,7 +254,7 @@ def read(path: Path, owner: Owner) -> State | None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Put the file in the place of the old one, on the disk; OSError where that fails, the old one stays then."""
+    """Replace the file on the disk; OSError where that fails, and the old one stays."""
     beside = path.with_name(path.name + ".new")
     try:
         with open(beside, "wb", opener=_private) as file:
@@ -278,7 +278,7 @@ def _private(path: str, flags: int) -> int:
 
 
 def digest(content: Any) -> str:
-    """SHA-256 of the canonical JSON."""
+    """Return the SHA-256 of the canonical JSON."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 

@@ -20,7 +20,7 @@ MAX_PERIOD_CHANGE = 0.05 * TICK
 
 
 def next_tick(tick: float, end: float) -> float:
-    """When the next tick is due.
+    """Return when the next tick is due.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from soilbus.can.bus import BusCounts
 def totals(
     windows: int, deadline_misses: int, failures: Mapping[str, int], bus: BusCounts, frames: Counts
 ) -> dict[str, int]:
-    """Counters by name.
+    """Return the counters by name.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ SAMPLE_RATE = 50.0
 
 
 def warm_up(config: Config, database: Database, ours: Database) -> list[WindowResult]:
-    """Rehearse with a pipeline and a publisher that are then thrown away.
+    """Run a pipeline and a publisher on a modelled drive, so that the first real window is not slow.
 
     Returns
     -------

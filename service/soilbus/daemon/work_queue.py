@@ -22,7 +22,7 @@ WINDOWS_PER_MEMORY_RELEASE = 60
 
 
 class Pending(NamedTuple):
-    """A window that the worker has, ended at a monotonic time [s] in an epoch of the intake."""
+    """Window that the worker has, ended at a monotonic time [s] in an epoch of the intake."""
 
     future: Future[WindowResult]
     at: float
@@ -30,12 +30,12 @@ class Pending(NamedTuple):
 
 
 def wait_for(future: Future[WindowResult], longest: float) -> None:
-    """Returns when the result is there, or after `longest` [s]."""
+    """Wait until the result is there, or for `longest` [s]."""
     wait([future], longest)
 
 
 class WorkQueue:
-    """Windows for `workers` (one thread), which solves them beside the loop.
+    """Queue of windows for `workers` (one thread), which solves them beside the loop.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class WorkQueue:
 
     @property
     def solving_since(self) -> float | None:
-        """When the worker began with the oldest window, or got it [s]; None where it has none."""
+        """Time [s] at which the worker began with the oldest window, or got it; None without one."""
         return self._busy_since if self._pending else None
 
     @property
@@ -113,7 +113,7 @@ class WorkQueue:
             self._waiting(self._pending[0].future, longest)
 
     def results(self, now: float) -> Iterator[tuple[WindowResult, Pending]]:
-        """The windows that are solved, in their order; now and then the worker gives back free memory after one."""
+        """Yield the solved windows in their order; now and then the worker frees memory after one."""
         while self.has_result:
             pending = self._pending.popleft()
             self._busy_since = now

@@ -51,13 +51,13 @@ Cause = Literal["torque", "traction", "sinkage", "slip"]
 
 
 class Duty(NamedTuple):
-    """What the pull is used for: a draft [N] and a slope (its sine); the one that is None uses the rest of it."""
+    """Use of the pull: a draft [N] and a slope (its sine); the one that is None takes the rest."""
 
     draft: Any = None
     sine: float | None = 0.0
 
     def split(self, pull: Any, weight: float) -> tuple[Any, Any]:
-        """Draft [N] and sine of the slope that use this pull [N] of a vehicle of this weight [N]."""
+        """Return the draft [N] and the sine of the slope that use this pull [N] of a vehicle of this weight [N]."""
         if self.draft is None:
             return pull - weight * (self.sine or 0.0), self.sine
         return self.draft, (pull - self.draft) / weight
@@ -77,7 +77,7 @@ class Columns(NamedTuple):
     @staticmethod
     @cache
     def of(kinds: int) -> Columns:
-        """The columns for this number of kinds of wheels."""
+        """Return the columns for this number of kinds of wheels."""
         return Columns(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
 
 
@@ -126,7 +126,7 @@ class Balance:
         return self.columns[:, self.at.angle]
 
     def drawn(self, points: SigmaPoints) -> Balance:
-        """The balance of a posterior's mode and draws (1 + N instead of D), from the balance of its sigma points."""
+        """Return the balance of a posterior's mode and draws (1 + N instead of D), from that of its sigma points."""
         known = np.broadcast_to(self.known[0], (len(points.share), len(self.slip)))
         if not self.known.all():
             known = known & (points.drawn(self.known.astype(float)) > 0.5)
@@ -146,7 +146,7 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: ModelOfRows) -> Limits:
-        """The limits of each kind of wheel.
+        """Return the limits of each kind of wheel.
 
         Parameters
         ----------
@@ -173,7 +173,7 @@ class Limits(NamedTuple):
         return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE), motors)
 
     def of_motors(self, torque: Array) -> Array:
-        """Torques of the motors (D, G, ...) from those of one wheel of each kind (D, A, ...)."""
+        """Return the torques of the motors (D, G, ...) from those of one wheel of each kind (D, A, ...)."""
         return torque if len(self.motors) == self.motors.shape[1] else np.einsum("ga,da...->dg...", self.motors, torque)
 
 
@@ -195,7 +195,7 @@ class BetweenSlips(NamedTuple):
     share: Array
 
     def on(self, values: Array) -> Array:
-        """Values (D, ..., F) linearly interpolated at the point: (D, ...)."""
+        """Return values (D, ..., F) interpolated linearly at the point: (D, ...)."""
         row = np.arange(len(values))
         here, there = values[row, ..., self.before], values[row, ..., self.before + 1]
         share = self.share.reshape(-1, *(1,) * (here.ndim - 1))
@@ -203,7 +203,7 @@ class BetweenSlips(NamedTuple):
 
 
 def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None) -> Balance:
-    """Steady states under a duty, on a slip grid SUBDIVISIONS times as fine as the table's.
+    """Return the steady states under a duty, on a slip grid SUBDIVISIONS times as fine as the table's.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None)
 
 
 def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list[Balance]:
-    """The `balance` with each of the drafts [N] and the slope that uses the rest of the pull; all solved together."""
+    """Return the `balance` with each of the drafts [N] and the slope that uses the rest of the pull."""
     slip, cell, _, _, of_changes = _refinement(tuple(table.slip.tolist()))
     changes, balanced = _change_under(table, Duty(np.array(drafts)[:, None, None], None))
     columns = level.columns + _interpolated(changes, of_changes)
@@ -239,7 +239,7 @@ def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list
 
 
 def largest_pull(balance: Balance, limits: Limits) -> Largest:
-    """Largest pull over slip within the limits.
+    """Return the largest pull over slip within the limits.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
 
 
 def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
-    """Which steady states (D, F) are within the limits."""
+    """Return which steady states (D, F) are within the limits."""
     usable = balance.known.copy()
     of_motors = limits.of_motors(balance.torque)
     for motor, torque in enumerate(limits.torque):
@@ -287,7 +287,7 @@ def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
 
 
 def point_of_pull(balance: Balance, pull: float) -> BetweenSlips:
-    """The least slip at which each soil gives this pull [N]; the first slip if it gives more, none if no slip does."""
+    """Return the least slip at which each soil gives this pull [N]: the first slip if it gives more, else none."""
     enough = balance.known & (balance.pull >= pull)
     first = enough.argmax(axis=1)
     before = np.maximum(first - 1, 0)
@@ -300,7 +300,7 @@ def point_of_pull(balance: Balance, pull: float) -> BetweenSlips:
 
 
 def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -> Array:
-    """Slips at which quantities are largest within the limits.
+    """Return the slips at which quantities are largest within the limits.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
 
 
 def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
-    """Sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), each times a factor (A, 1)."""
+    """Return the sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), times a factor (A, 1)."""
     share = (axles.count * each)[:, 0]
     return np.asarray(np.einsum("a,daf->df", share[kinds], values[:, kinds]))
 

@@ -157,14 +157,14 @@ class Capability:
 
 @cache
 def slip_grid(max_slip: float) -> Array:
-    """Slips (GRID_SLIPS,) at which the wheels are computed, quadratically spaced: closer at small slips."""
+    """Return the slips (GRID_SLIPS,) at which the wheels are computed, quadratically spaced: closer at small slips."""
     least = min(MIN_SLIP, max_slip / 2.0)
     return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID_SLIPS) ** 2)
 
 
 @cache
 def skid_grid(max_slip: float) -> Array:
-    """Slips (SKID_GRID_SLIPS,) of wheels that are pushed, up to the least one of `slip_grid`."""
+    """Return the slips (SKID_GRID_SLIPS,) of wheels that are pushed, up to the least one of `slip_grid`."""
     return np.linspace(-MAX_SKID, slip_grid(max_slip)[0], SKID_GRID_SLIPS)
 
 
@@ -178,7 +178,7 @@ def assess(
     max_sinkage: float,
     last: WheelTable | None = None,
 ) -> tuple[Capability | None, WheelTable]:
-    """Capability on one soil.
+    """Return the capability on one soil.
 
     Parameters
     ----------

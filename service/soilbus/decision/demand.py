@@ -25,7 +25,7 @@ NO_GAIN_ERROR = Estimate(0.0, 0.0)
 def present_demand(
     window: Window, chassis: Chassis | None, hop: float, gain: Estimate = NO_GAIN_ERROR
 ) -> Demand | None:
-    """Draft and slope over the last hop or the whole window, whichever mean is larger.
+    """Return the draft and slope over the last hop or the whole window, whichever mean is larger.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from soilbus.sensors.options import CONSISTENCY
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which wheels do not drive: without torque while another one pulls, for most of the time after `since`.
+    """Return which wheels do not drive: without torque while another one pulls, for most of the time after `since`.
 
     Parameters
     ----------

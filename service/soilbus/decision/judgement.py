@@ -40,7 +40,7 @@ def judge(
     settings: Settings,
     last: WheelTable | None = None,
 ) -> tuple[Traversability, WheelTable | None]:
-    """Traversability of the ground of one window.
+    """Decide whether the vehicle can go on, on the ground of one window.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def judge(
 
 
 def spare_pull(capability: Capability, demand: Demand, settings: Settings) -> Estimate | None:
-    """Pull [N] on the present slope less the demand and its margin; None where no steady driving exists."""
+    """Return the pull [N] on the present slope less the demand and its margin; None where no steady driving exists."""
     if capability.likely_pull is None:
         return None
     needed = demand.pull + settings.margin * max(demand.pull, 0.0)
@@ -103,7 +103,7 @@ def spare_pull(capability: Capability, demand: Demand, settings: Settings) -> Es
 
 
 def probability_of_depth(capability: Capability, settings: Settings) -> float:
-    """Probability that the deepest wheel stays within the sinkage limit; 1 where no slip gives the demand."""
+    """Return the probability that the deepest wheel stays within max_sinkage; 1 where no slip gives the demand."""
     if capability.forecast is None:
         return 1.0
     deepest = capability.forecast.likely_depth
@@ -129,7 +129,7 @@ class Basis(NamedTuple):
 
 
 def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float, config: Config) -> Traversability:
-    """What remains of a window's decision at a later time.
+    """Return a window's decision as far as it holds at a later time.
 
     A decision is valid for the time and place of its data, and is overruled by what the wheels show:
 
@@ -186,7 +186,7 @@ def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float,
 
 
 def missing_pull(watch: Watch, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
-    """Pull [N] that the estimate predicts at the present slip and the wheels significantly do not give; else 0.
+    """Return the pull [N] by which the wheels give significantly less than predicted at their slip; else 0.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def missing_pull(watch: Watch, curve: OverSlip, noise: NoiseOfChannels, deviatio
 
 
 def excess_slip(watch: Watch, predicted: Estimate, config: Config, deviations: float) -> float:
-    """Slip beyond the predicted one, as far as it is significant; else 0.
+    """Return the slip by which the wheels slip significantly more than predicted; else 0.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def excess_slip(watch: Watch, predicted: Estimate, config: Config, deviations: f
 
 
 def slip_needed(pull: float, curve: OverSlip, noise: NoiseOfChannels) -> Estimate | None:
-    """The least slip that gives a pull [N]; None where none does, or where slip hardly changes the pull.
+    """Return the least slip that gives a pull [N]; None where none does, or where slip hardly changes the pull.
 
     Notes
     -----

@@ -28,7 +28,7 @@ __all__ = ["Moment", "Sample", "bins_of_a_moment", "common_slip", "moment_of", "
 
 
 class Sample(NamedTuple):
-    """One bin; nan where not known.
+    """Readings of one bin; nan where not known.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Sample(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """Means over some bins; nan where not known.
+    """Means of the readings over some bins; nan where not known.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Moment(NamedTuple):
 
 
 def common_slip(slips: Sequence[float], exponent: float = WATCH.slip_exponent) -> float:
-    """The slip at which all wheels would give the mean of what they give at their own slips.
+    """Return the slip at which all wheels would give the mean of what they give at their own slips.
 
     Parameters
     ----------
@@ -130,12 +130,12 @@ def common_slip(slips: Sequence[float], exponent: float = WATCH.slip_exponent) -
 
 
 def bins_of_a_moment(bin_length: float) -> int:
-    """Number of bins of a length [s] over which a moment's means go."""
+    """Return the number of bins of a length [s] over which a moment's means go."""
     return max(round(WATCH.moment_span / bin_length), 1)
 
 
 def moment_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], config: Config) -> Moment | None:
-    """The mean over a short forward window; None without a bin or a chassis.  Parameters as of `moments`."""
+    """Return the mean over a short forward window; None without a bin or a chassis.  Parameters as of `moments`."""
     bins = len(window.t)
     found = moments(window, rig, torque_limit, config, np.arange(bins)[-1:], bins)
     return found[0] if found else None
@@ -144,7 +144,7 @@ def moment_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], confi
 def moments(
     window: Window, rig: Rig, torque_limit: NDArray[np.float64], config: Config, chosen: NDArray[np.intp], bins: int
 ) -> list[Moment]:
-    """The means over the last bins at each of some bins of a forward window.
+    """Return the means over the last bins at each of some bins of a forward window.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ __all__ = ["WATCH", "WatchOptions"]
 
 @dataclass(frozen=True, slots=True)
 class WatchOptions:
-    """Moments, trends, and causes to warn; shares are of the largest pull."""
+    """Tuning values of the watch: means, trends, and causes to warn; shares are of the largest pull."""
 
     moment_span: float = 0.3
     """Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake at 1.5 to

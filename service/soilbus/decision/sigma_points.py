@@ -74,7 +74,7 @@ class SigmaPoints:
 
     @classmethod
     def of(cls, posterior: Posterior, shifts: Array | None = None, width: float | None = None) -> SigmaPoints:
-        """The points of a posterior; similar posteriors have similar points in the same order.
+        """Return the points of a posterior; similar posteriors have similar points in the same order.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class SigmaPoints:
         return cls(soils, *_shares(leading, len(soils) - len(points)))
 
     def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
-        """Values at the mode and the draws from values at the points.
+        """Return values at the mode and the draws, from values at the points.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ def moduli(soil: Soil, steps: Array, width: float) -> Array:
 
 
 def mean_and_std(samples: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation over the draws.
+    """Return the mean and standard deviation over the draws.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
 
 
 def estimates(*samples: Array | None) -> list[Estimate | None]:
-    """Mean and std of scalars from their samples (1 + N,) each; None where there are no samples or the mean is nan.
+    """Return the mean and std of scalars from their samples (1 + N,) each; None without samples or with nan.
 
     With 256 draws, what happens on fewer than one soil in a hundred hardly enters the std.
     """
@@ -174,7 +174,7 @@ def estimates(*samples: Array | None) -> list[Estimate | None]:
 
 
 def likely(samples: Array | None) -> Estimate | None:
-    """First-order estimate of a scalar: its value at the mode and the std of its odd part.
+    """Return a first-order estimate of a scalar: its value at the mode and the std of its odd part.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def likely(samples: Array | None) -> Estimate | None:
 
 @cache
 def design(n: int) -> Array:
-    """Design points (P, n) for n independent standard normals, the origin first.
+    """Return the design points (P, n) for n independent standard normals, the origin first.
 
     Notes
     -----
@@ -230,7 +230,7 @@ def design(n: int) -> Array:
 
 @cache
 def normals(n: int, leading: int) -> Array:
-    """Draws of n standard normals with exact low moments.
+    """Return the draws of n standard normals with exact low moments.
 
     Parameters
     ----------

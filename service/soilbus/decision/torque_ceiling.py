@@ -4,7 +4,7 @@ Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked
 not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
 
     follows      T - b (Q - Q') - T' (N / N' - 1) has no trend     b = T' / sum(T' / r): its share of the thrust
-    saturated    T - T' is noise, and T does not follow            a trend: a slope beyond what its residuals explain
+    saturated    T - T' is noise without trend, and T does not follow      a trend: a slope beyond its residuals
 
 What shakes the vehicle has no trend, however little its sensors say of their noise.
 A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
@@ -50,7 +50,7 @@ class TorqueCeiling:
 
     @classmethod
     def unknown(cls, wheels: int) -> TorqueCeiling:
-        """The state before any measurement."""
+        """Return the state before any measurement."""
         no = np.zeros(wheels, bool)
         return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), np.zeros(wheels), no, no, no)
 
@@ -60,7 +60,7 @@ class TorqueCeiling:
         return np.where((self.lasts & self.unmet) | self.returned, self.level, np.nan)
 
     def after(self, window: Window, rig: Rig, span: float, deviations: float) -> TorqueCeiling:
-        """The state after the spans of a window that come after the last one.
+        """Return the ceiling after one more window, of which only new spans count.
 
         Parameters
         ----------
@@ -125,16 +125,21 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
         by_load = np.nan_to_num(mean * (window.load / window.load.mean(axis=0) - 1.0))
         spread = ((window.torque - mean) ** 2 / window.variance["torque"]).sum(axis=0)
         stands = spread <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
-        follows = [_trend(since, window.torque - by_pull - part) <= deviations for part in (0.0, by_load)]
+        stands &= _trend(since, window.torque) <= deviations
+        noise = window.variance["torque"].mean(axis=0)
+        follows = [_trend(since, window.torque - by_pull - part, noise) <= deviations for part in (0.0, by_load)]
     return np.asarray((share > 0.0) & stands & ~follows[0] & ~follows[1])
 
 
-def _trend(since: Array, values: Array) -> Array:
-    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959)."""
+def _trend(since: Array, values: Array, variance: Array | float = 0.0) -> Array:
+    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959).
+
+    The residuals have at least this variance.
+    """
     values, free = values - values.mean(axis=0), len(values) - 2
     spread = float((since**2).sum())
     slope = (since * values).sum(axis=0) / spread
-    rest = ((values - slope * since) ** 2).sum(axis=0) / free
+    rest = np.maximum(((values - slope * since) ** 2).sum(axis=0) / free, variance)
     share = (8.0 * free + 1.0) / (8.0 * free + 3.0)
     return np.asarray(share * np.sqrt(free * np.log1p(slope**2 * spread / rest / free)))
 

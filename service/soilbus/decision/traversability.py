@@ -29,7 +29,7 @@ __all__ = ["ORDER", "Held", "State", "Status", "Traversability", "doubted", "set
 
 
 class State(StrEnum):
-    """May the vehicle go on?"""
+    """Verdict whether the vehicle can go on."""
 
     GO = "go"
     CAUTION = "caution"
@@ -89,7 +89,7 @@ class Traversability:
 
 
 def state_of(probability: float, status: Status, settings: Settings) -> State:
-    """The state by a probability and a status, with the thresholds of the settings."""
+    """Return the state by a probability and a status, with the thresholds of the settings."""
     if probability < settings.no_go:
         return State.NO_GO
     if probability >= settings.go and status is Status.VALID:
@@ -103,14 +103,14 @@ ORDER = (State.NO_GO, State.CAUTION, State.GO)
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """The state in force, and the states of the last windows by the raised thresholds."""
+    """State in force, and the states of the last windows by the raised thresholds."""
 
     state: State = State.UNKNOWN
     recent: tuple[State, ...] = ()
 
 
 def settled(last: Held, probability: float | None, status: Status, settings: Settings) -> Held:
-    """The state in force after one more window.
+    """Return the state in force after one more window.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def settled(last: Held, probability: float | None, status: Status, settings: Set
 
 
 def doubted(last: Held) -> Held:
-    """The state in force while the ground changes and the new soil is not known: caution, or no_go if it was no_go."""
+    """Return the state in force while the ground changes and the new soil is unknown: caution, or still no_go."""
     state = min(last.state, State.CAUTION, key=_rank) if last.state is not State.UNKNOWN else State.CAUTION
     return Held(state, (state,))
 

@@ -61,7 +61,7 @@ class LocalTrend(NamedTuple):
         )
 
     def probability_above(self, level: float, horizon: float) -> float:
-        """Probability that the value passes a level within a time [s]; 0 before any sample."""
+        """Return the probability that the value passes a level within a time [s]; 0 before any sample."""
         if math.isinf(self.var):
             return 0.0
         var = self.var + horizon * (2.0 * self.cov + horizon * self.rate_var)
@@ -118,7 +118,7 @@ class Extrapolation(NamedTuple):
         return Extrapolation(line, foreseen, error, checks)
 
     def probability_above(self, level: float, std: float, options: WatchOptions = WATCH) -> float:
-        """Probability that the line passes a level of this sd within `warning_time`; 0 where it does not rise."""
+        """Return the probability that the line passes a level of this sd within `warning_time`; 0 if it falls."""
         if not self.checks > 0.0 or self.line.slope <= 0.0:
             return 0.0
         error = math.sqrt(self.error / self.checks) * options.warning_time / options.check_lag
@@ -126,5 +126,5 @@ class Extrapolation(NamedTuple):
         return 0.5 * math.erfc(spare / (math.sqrt(2.0) * math.hypot(error, std, 1e-9)))
 
     def time_to(self, level: float) -> float:
-        """Time [s] until a line that rises reaches a level."""
+        """Return the time [s] until a line that rises reaches a level."""
         return max(level - self.line.value, 0.0) / self.line.slope

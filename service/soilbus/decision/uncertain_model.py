@@ -58,7 +58,7 @@ class UncertainModel:
 
     @classmethod
     def over(cls, model: WheelModel | CompletedModel | UncertainModel) -> UncertainModel:
-        """An exactly known model as an UncertainModel; an uncertain one as it is."""
+        """Return an exactly known model as an UncertainModel, and an uncertain one unchanged."""
         return model if isinstance(model, UncertainModel) else cls(CompletedModel.over(model))
 
     @classmethod
@@ -66,7 +66,7 @@ class UncertainModel:
         cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], gaussian: Gaussian, n_wheels: int,
         ground_speed: float, form: FormPosterior | None = None,
     ) -> UncertainModel:  # fmt: skip
-        """The model with the effects' parameters as a window's posterior has them.
+        """Return the model with the effects' parameters as a window's posterior has them.
 
         Parameters
         ----------
@@ -116,12 +116,12 @@ class UncertainModel:
         return np.array([one.shift for one in self.perturbed]).reshape(-1, _SOIL)
 
     def with_form(self, log_covariance: Array) -> Array:
-        """Covariance (6, 6) of the soil's logarithms: a fit's own plus that due to the model's form."""
+        """Return the covariance (6, 6) of the soil's logarithms: a fit's own plus that due to the model's form."""
         along = self.shifts[len(self.perturbed) - self.of_form :]
         return np.asarray(log_covariance + along.T @ along)
 
     def of_rows(self, n: int) -> ModelOfRows:
-        """The models of n rows of soils; the last rows belong to the perturbed models."""
+        """Return the models of n rows of soils; the last rows belong to the perturbed models."""
         known = n - len(self.perturbed)
         row = np.concatenate([np.zeros(known, int), 1 + np.arange(len(self.perturbed))])
         return ModelOfRows((self.mean, *[one.model for one in self.perturbed]), row)
@@ -161,11 +161,11 @@ class ModelOfRows:
         return self.models[int(self.row[0])]
 
     def of(self, rows: NDArray[np.intp]) -> ModelOfRows:
-        """The models of some of the rows."""
+        """Return the models of some of the rows."""
         return ModelOfRows(self.models, self.row[rows])
 
     def forces_and_slopes(self, state: WheelState, rear: Any, load: Array) -> tuple[Array, Slopes]:
-        """Forces (3, D, ...) [N, N, N m] and their derivatives at states and loads [N] (D, ...)."""
+        """Return the forces (3, D, ...) [N, N, N m] and their derivatives at states and loads [N] (D, ...)."""
 
         def rows(model: CompletedModel, at: _Rows) -> Array:
             part = WheelState(*[a if isinstance(a, float) else a[at] for a in state])
@@ -176,13 +176,13 @@ class ModelOfRows:
         return found[0], Slopes(*found[1:])
 
     def sinkage(self, angle: Array, wheel: Wheel) -> Array:
-        """Sinkage [m] (D, A) at entry angles [rad] (D, A) of wheels (A,) with loads (D, A)."""
+        """Return the sinkage [m] (D, A) at entry angles [rad] (D, A) of wheels (A,) with loads (D, A)."""
         return self._by_model(
             lambda model, at: model.sinkage(angle[at], wheel._replace(load=wheel.load[at])), angle.shape
         )
 
     def angle_of_sinkage(self, depth: float, wheel: Wheel) -> Array:
-        """Entry angle [rad] (D, A) at which wheels (A,) have this sinkage [m]."""
+        """Return the entry angle [rad] (D, A) at which wheels (A,) have this sinkage [m]."""
         shape = (len(self.row), *np.shape(wheel.radius))
         return self._by_model(
             lambda model, at: np.broadcast_to(

@@ -11,9 +11,9 @@
     slips          s > 0.7 s_max
 
 P: pull given, P_hat: pull over slip of the last window (Kalman filter and regressions with exponential forgetting).
-The first three need no soil: a local linear trend follows q, V and sinkage, and how much slip shakes widens it.  Nor
-does slip that creeps.  The others need the curve and some seconds of moments, which are kept and seen along the newest
-curve: so a new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.
+The first three and `creeps` need no soil: a local linear trend follows q, V and sinkage, and slip that shakes widens
+it.  The others need the curve and some seconds of moments.  The moments are kept and seen along the newest curve: so a
+new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.
 
 Spinning or stalling for `spin_time` overrules a go of the estimate; without any way for `stuck_time` the vehicle is
 stuck, until it has moved.
@@ -49,7 +49,7 @@ SLOPE_WANDER = 0.03
 
 
 class Alert(StrEnum):
-    """Is the vehicle about to get stuck?"""
+    """Warning of immobilisation."""
 
     UNKNOWN = "unknown"
     NONE = "none"
@@ -57,7 +57,7 @@ class Alert(StrEnum):
 
 
 class Stall(NamedTuple):
-    """What slip and speed alone say of a stall ahead; `stalling` makes the next one.
+    """Signs of a stall in slip and speed alone; `stalling` makes the next one.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def stalling(
     before: Stall, sample: Sample, min_speed: float, settings: Settings, limits: Traversability,
     options: WatchOptions = WATCH,
 ) -> Stall:  # fmt: skip
-    """Return what slip and speed say after one more sample; samples in their order, at any rate.
+    """Return the signs of a stall after one more sample; samples in their order, at any rate.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _time_to(trend: LocalTrend, level: float) -> float:
 
 
 class Margin(NamedTuple):
-    """What the curve leaves of the ground's capacity; `left_by` makes the next one.
+    """Share of the ground's capacity that is left, by the curve of pull over slip; `left_by` makes the next one.
 
     Attributes
     ----------
@@ -238,7 +238,7 @@ def left_by(
     before: Margin, row: tuple[float, float, float, float], curve: OverSlip | None, max_slip: float,
     options: WatchOptions = WATCH,
 ) -> Margin:  # fmt: skip
-    """Return what is left of the capacity after one more row of `Margin.rows`, as a curve has it."""
+    """Return the margin after one more row of `Margin.rows`, by a curve of pull over slip."""
     t, slip, *_ = row
     last = float(before.rows[-1, 0]) if len(before.rows) else -math.inf
     if not 0.0 < t - last <= LONGEST_GAP:
@@ -467,7 +467,7 @@ def seen_at(watch: Watch, now: float, config: Config, options: WatchOptions = WA
 
 
 def ended(watch: Watch, config: Config) -> Watch:
-    """Return the watch after a decision is go: a warning without a cause is over."""
+    """Return the watch once a decision is go: a warning without a cause ends."""
     return seen_at(watch._replace(caused=-math.inf), watch.t, config)
 
 
@@ -525,7 +525,7 @@ def _others_grip(moment: Moment, spins: Sequence[bool]) -> bool:
 
 
 class Warnings(NamedTuple):
-    """When warnings began [s]: the present one (None without), and those since the last window, ended or not."""
+    """Times [s] at which warnings began: the present one (None without), and those since the last window."""
 
     since: float | None = None
     begun: tuple[float, ...] = ()

@@ -80,12 +80,12 @@ class Axles:
 
     @property
     def drives(self) -> NDArray[np.bool_]:
-        """(W,), which wheels are driven."""
+        """Which wheels are driven (W,)."""
         return np.asarray(self.driven[self.of_wheel, 0])
 
     @classmethod
     def of(cls, rig: Rig, drives: NDArray[np.bool_]) -> Axles:
-        """The kinds of a rig's wheels.
+        """Return the kinds of a rig's wheels.
 
         Parameters
         ----------
@@ -119,7 +119,7 @@ class Axles:
         return cls(rig.chassis, radius, width, ahead == 1.0, drive, count, level, tilt, lever, of_wheel, shared, length)
 
     def wheel(self, load: Array) -> Wheel:
-        """One wheel of each kind under a load [N] (..., A)."""
+        """Return one wheel of each kind under a load [N] (..., A)."""
         return Wheel(self.radius[:, 0], self.width[:, 0], ~self.front[:, 0], load)
 
     @property
@@ -128,7 +128,7 @@ class Axles:
         return self.chassis.mass * GRAVITY
 
     def loads(self, draft: Any, sine: Any) -> Array:
-        """Load on each wheel [N] (..., A, S) for a draft [N] and a slope's sine, each (..., S)."""
+        """Return the load on each wheel [N] (..., A, S) for a draft [N] and a slope's sine, each (..., S)."""
         draft = np.atleast_1d(draft)[..., None, :]
         sine = np.atleast_1d(np.minimum(np.maximum(sine, -MAX_SINE), MAX_SINE))[..., None, :]
         return np.asarray(self.level * np.sqrt(1.0 - sine * sine) + self.tilt * sine + self.lever * draft)
@@ -172,13 +172,13 @@ class WheelTable:
     balanced: NDArray[np.bool_]
 
     def pull_at(self, load: Array) -> Array:
-        """Pull of the vehicle [N] (..., D, S) with its wheels at other loads (..., D, A, S)."""
+        """Return the pull of the vehicle [N] (..., D, S) with its wheels at other loads (..., D, A, S)."""
         change = load - self.load
         drawbar = self.at[DRAWBAR] + change * (self.by_load[DRAWBAR] + self.half_second_derivative[DRAWBAR] * change)
         return np.asarray((self.axles.count * drawbar).sum(axis=-2))
 
     def change_at(self, load: Array) -> list[Array]:
-        """Changes of drawbar pull, torque and entry angle (..., D, A, S) at other loads (..., D, A, S)."""
+        """Return the changes of drawbar pull, torque and entry angle (..., D, A, S) at other loads (..., D, A, S)."""
         change = load - self.load
         derivatives = zip(self.by_load, self.half_second_derivative, strict=True)
         return [change * (first + half_second * change) for first, half_second in derivatives]
@@ -193,7 +193,7 @@ def wheel_table(
     tolerance: float = NEWTON_TOLERANCE,
     driven: NDArray[np.bool_] | None = None,
 ) -> WheelTable:
-    """Steady level driving on D soils at S slips.
+    """Return the steady level driving on D soils at S slips.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ UNKNOWN_SHARE = 0.02
 
 
 def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
-    """The vehicle with all its wheels, or a test rig with one.
+    """Return the vehicle with all its wheels, or a test rig with one.
 
     Parameters
     ----------
@@ -74,9 +74,11 @@ def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
     slip, computed = noise.pop("slip"), noise.pop("computed_load")
     noise["differential_lock"] = SensorNoise(absolute=1.0)
-    if of_table:  # its speeds are computed from the slip, see tables.py; a few steady rows have the noise that they say
+    if of_table:  # its speeds are computed from the slip, see tables.py
         noise |= {"speed": SensorNoise(), "ground_speed": slip}
-        options = replace(options, variance=replace(options.variance, least=1.0, most=1.0))
+        # its rows are no means of several bins, whose noise is less
+        steady = replace(options.tracker, several_soils=options.search.plausible_chi2)
+        options = replace(options, variance=replace(options.variance, least=1.0), tracker=steady)
     rig = Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),
@@ -151,7 +153,7 @@ def _unmeasured(config: Config) -> Iterator[str]:
 
 
 class Motor(NamedTuple):
-    """A motor by the name of its wheel or axle: the wheels that it drives, the part of its torque that each gets, and
+    """Motor by the name of its wheel or axle: the wheels that it drives, each one's part of the torque, and
 
     max_torque [N m] at the wheel or the axle, nan where not known.  share: torque of each wheel for one unit of the
     motor's, where all slip alike.
@@ -171,7 +173,7 @@ class Motors(NamedTuple):
 
 
 def motors_of(config: Config, rig: Rig) -> Motors:
-    """The motors of a rig's vehicle."""
+    """Return the motors of a rig's vehicle."""
     if not rig.wheels:
         return Motors((), np.zeros(0, bool))
     motors = [Motor(w.name, (i,), (1.0,), w.max_torque or math.nan) for i, w in enumerate(config.wheel)]
@@ -318,7 +320,7 @@ def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> li
 
 
 def chassis_of(config: Config) -> Chassis | None:
-    """Mass and geometry; None for a test rig."""
+    """Return the mass and geometry; None for a test rig."""
     if config.vehicle is None:
         return None
     given = config.vehicle.model_dump(include={f.name for f in fields(Chassis)})
@@ -326,17 +328,17 @@ def chassis_of(config: Config) -> Chassis | None:
 
 
 def prior_of(config: Config) -> SoilPrior:
-    """Prior of the soil parameters."""
+    """Return the prior of the soil parameters."""
     return SoilPrior.from_value_std({name: (p.value, p.std) for name, p in config.soil_prior.items()})
 
 
 def model_of(config: Config) -> WheelModel:
-    """The wheel-soil model of fits, without effects."""
+    """Return the wheel-soil model of fits, without effects."""
     return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES, rollers=config.rollers)
 
 
 def form_of(config: Config) -> tuple[float, ...]:
-    """How far each of `model_form.FORM` may be from the model; 0 where an effect of the model has that parameter."""
+    """Return how far each of `model_form.FORM` may be from the model; 0 where an effect has that parameter."""
     named, form = {effect.name for effect in config.model.effects}, config.model.form
     peak = 0.0 if "stress_peak_shift" in named else 1.0
     leave, shear = float("rut_recovery" not in named), float("exponential_shear" not in named)
@@ -344,7 +346,7 @@ def form_of(config: Config) -> tuple[float, ...]:
 
 
 def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Active, ...]:
-    """The effects of model.effects with their values, in the order of the catalogue.
+    """Return the effects of model.effects with their values, in the order of the catalogue.
 
     Parameters
     ----------
@@ -392,7 +394,7 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
 
 
 def possible_effects(config: Config) -> list[Effect]:
-    """The effects of the catalogue that the machine can have: its tyres, its sensors."""
+    """Return the effects of the catalogue that the machine can have, with its tyres and sensors."""
     from soilbus.terra.effects.catalogue import CATALOGUE
 
     return [
@@ -413,7 +415,7 @@ def _has_tyres(config: Config) -> bool:
 
 
 def delays_of(config: Config) -> dict[str, float]:
-    """Delay [s] of each quantity by the effects of model.effects that make it late; ConfigError as `effects_of`."""
+    """Return the delay [s] of each quantity by the effects of model.effects; ConfigError as `effects_of`."""
     if not config.model.effects:
         return {}
     from soilbus.terra.effects.sensors import lateness
@@ -422,7 +424,7 @@ def delays_of(config: Config) -> dict[str, float]:
 
 
 def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
-    """The effects of the estimator's model and their parameters.
+    """Return the effects of the estimator's model and their parameters.
 
     Parameters
     ----------
@@ -462,7 +464,7 @@ def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[t
 
 
 def with_effects(config: Config, texts: Iterable[str]) -> Config:
-    """The configuration with effects added or changed.
+    """Return the configuration with effects added or changed.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ from soilbus.estimation.window import Window
 
 
 class ChangeStatistic(NamedTuple):
-    """Index of the first instant that may be on another soil, its log likelihood ratio, and the threshold of that."""
+    """Index of the first instant that may be on another soil, its log likelihood ratio, and the threshold."""
 
     instant: int
     ratio: float
@@ -44,14 +44,14 @@ class ChangeStatistic(NamedTuple):
 
     @property
     def is_alarm(self) -> bool:
-        """Whether noise is not the reason."""
+        """Whether the ratio passes the threshold, so that noise is not the reason."""
         return self.ratio > self.threshold
 
 
 def change_statistic(
     objective: Objective, joint_prior: Gaussian, iterate: Iterate, at: Linearisation, first: int, false_alarms: float
 ) -> ChangeStatistic:
-    """The likeliest beginning of another soil among the instants from `first` on.
+    """Return the likeliest beginning of another soil among the instants from `first` on.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def _explained(gradient: Array, information: Array) -> Array:
 
 
 def log_likelihood_ratio(misfit: Array, count: Array) -> Array:
-    """GLR (N,) from each instant on, by the sum of squares and the number of residuals of each instant (N,)."""
+    """Return the GLR (N,) from each instant on, from each instant's sum of squares and number of residuals (N,)."""
     misfit, count = np.cumsum(np.stack([misfit, count])[:, ::-1], axis=1)[:, ::-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.maximum(misfit / count, 1.0)
@@ -113,7 +113,7 @@ def log_likelihood_ratio(misfit: Array, count: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def alarm_threshold(probability: float, instants: int, residuals: int) -> float:
-    """The threshold that the largest GLR of noise passes with a given probability.
+    """Return the threshold that the largest GLR of noise passes with a given probability.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class Transition(NamedTuple):
 
 
 def without_transition(window: Window, transition: Transition, ahead: Array) -> Window:
-    """The window without the wheels' measurements during a transition.
+    """Return the window without the wheels' measurements during a transition.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ LINEAR = np.array([_K_C, _N, _PHI, _C])
 
 
 def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
-    """Changes (6,) from a base (6,) to a soil (6,) in which windows are linear, and derivatives by the logarithms.
+    """Return changes (6,) from a base (6,) to a soil (6,) in which windows are linear, and their derivatives.
 
     Each is that of the parameter's logarithm at the base.  There and elsewhere the LINEAR parameters change linearly;
     that of k_phi is log K_L less the part of k_c, K_L = k_c / width + k_phi; K changes by its logarithm.
@@ -94,7 +94,7 @@ class Gaussian:
 
     @classmethod
     def of(cls, prior: SoilPrior, gain_std: Array) -> Gaussian:
-        """Before any window: the configured prior, and independent gains with mean 0 and this sd (G,)."""
+        """Return the joint prior before any window: the configured soil, and gains with mean 0 and this sd (G,)."""
         variance = np.concatenate([prior.log_std, gain_std]) ** 2
         return cls(prior.median, np.zeros(len(gain_std)), np.diag(variance))
 
@@ -104,32 +104,32 @@ class Gaussian:
         return Posterior(Soil(*self.soil.tolist()), self.covariance[:_SOIL, :_SOIL])
 
     def gain(self, index: int) -> Estimate:
-        """The marginal of one gain."""
+        """Return the marginal of one gain."""
         return Estimate(float(self.gains[index]), float(np.sqrt(self.covariance[_SOIL + index, _SOIL + index])))
 
     def shifted(self, step: Array, covariance: Array) -> Gaussian:
-        """With its mean shifted by a step (6 + G,) of logarithms and gains, and another covariance."""
+        """Return the Gaussian with its mean shifted by a step (6 + G,), and with another covariance."""
         gains = self.gains + step[_SOIL:]
         if self.offset is None:
             return Gaussian(self.soil * np.exp(step[:_SOIL]), gains, covariance)
         return Gaussian(self.soil, gains, covariance, self.offset + step[:_SOIL])
 
     def drifted(self, soil: Array, gains: Array) -> Gaussian:
-        """After a random walk of the soil's logarithms, covariance (6, 6), and of the gains, variance (G,)."""
+        """Return the Gaussian after a random walk of the soil (covariance (6, 6)) and the gains (variance (G,))."""
         covariance = self.covariance.copy()
         covariance[:_SOIL, :_SOIL] += soil
         covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] += gains
         return replace(self, covariance=covariance)
 
     def with_prior_soil(self, prior: SoilPrior) -> Gaussian:
-        """The marginal of the gains with the prior of the soil: on another soil only the gains stay known."""
+        """Return the marginal of the gains with the prior of the soil, as on another soil."""
         covariance = self.covariance.copy()
         covariance[:_SOIL] = covariance[:, :_SOIL] = 0.0
         covariance[range(_SOIL), range(_SOIL)] = prior.log_std**2
         return Gaussian(prior.median, self.gains, covariance)
 
     def likelihood_factor(self, prior: SoilPrior) -> Gaussian:
-        """The posterior with the priors of the logarithms of LINEAR divided out.
+        """Return the posterior with the priors of the logarithms of LINEAR divided out.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class Gaussian:
         return replace(self, offset=np.zeros(_SOIL)).shifted(off, covariance)
 
     def relinearised(self, soil: Array, gains: Array, prior: SoilPrior, width: float) -> Gaussian:
-        """About another mean, with the covariance that the same linear model and the prior have there.
+        """Return the Gaussian about another mean, by the same linear model and prior.
 
         What compensates for a LINEAR parameter is proportional to the parameter itself, and so more or less of its
         logarithm; the prior stays that of the logarithm.
@@ -246,7 +246,7 @@ class PriorFactor:
             self.least_value = self._least()
 
     def quadratic_at(self, soil: Array, gains: Array, by_logs: Array) -> PriorQuadratic:
-        """-2 log prior about a soil (6,) with gains (G,).
+        """Return -2 log prior about a soil (6,) with gains (G,).
 
         Parameters
         ----------
@@ -265,7 +265,7 @@ class PriorFactor:
         return PriorQuadratic(slopes.T @ self.precision @ slopes, gradient, value, of_data)
 
     def residuals(self, soil: Array, gains: Array) -> Array:
-        """The residuals (R,) of a soil (6,) with gains (G,)."""
+        """Return the residuals (R,) of a soil (6,) with gains (G,)."""
         off = np.concatenate([np.log(soil[self._free]), gains[self._active]]) - self._mean
         if not self._is_likelihood_factor:
             return np.asarray(off)
@@ -274,7 +274,7 @@ class PriorFactor:
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
     def jacobian(self, soil: Array, by_logs: Array) -> Array:
-        """Derivatives (R, M) of the residuals by M unknowns.
+        """Return the derivatives (R, M) of the residuals by M unknowns.
 
         Parameters
         ----------
@@ -297,7 +297,7 @@ class PriorFactor:
         return last[1]
 
     def jacobian_by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
-        """Derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean, with precision and residuals."""
+        """Return the derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean."""
         by_mean = -shift[np.concatenate([self._free, _SOIL + self._active])]
         if self._is_likelihood_factor:  # the priors of the logarithms do not shift
             by_mean = np.vstack([by_mean, np.zeros((len(self._linear), by_mean.shape[1]))])
@@ -324,7 +324,7 @@ class PriorFactor:
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:
-    """information^-1 gradient (F,) and information^-1 (F, F), scaled to a unit diagonal; None where it is singular."""
+    """Return information^-1 gradient (F,) and information^-1 (F, F); None where it is singular."""
     scale = 1.0 / np.sqrt(information.diagonal())
     scales = scale[:, None] * scale
     try:

@@ -92,7 +92,7 @@ class Observations(NamedTuple):
     by_draft: Array
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
-        """Those of the given instants."""
+        """Return the observations of the given instants."""
         return Observations(*(a[keep] for a in self))
 
 
@@ -147,7 +147,7 @@ class Instrumentation:
 
     @property
     def sides(self) -> tuple[tuple[int, int], ...]:
-        """Row of torques and row of loads of each two wheels with equal torques whose loads' difference is computed."""
+        """Row of torques and row of loads of each two wheels with equal torques and computed loads."""
         wheels = {q: [np.array(row.weight) != 0.0 for row in getattr(self, q)] for q in ("torque", "load")}
         return tuple(
             (i, k)
@@ -165,7 +165,7 @@ class Instrumentation:
         return np.array([any(row.weight[w] for row in free) for w in range(len(self.speed))])
 
     def computes(self, quantity: str) -> NDArray[np.bool_]:
-        """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
+        """Return which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)
         return np.array([any(r.weight[w] for r in rows if r.kind != "channel") for w in range(len(rows))])
 
@@ -173,7 +173,7 @@ class Instrumentation:
 def rows_of(
     n_wheels: int, channels: Sequence[Group], gain: float, otherwise: Sequence[Row]
 ) -> tuple[tuple[Row, ...], tuple[str, ...]]:
-    """W independent rows: the channels first, then what else is known; and names (W,) of the raw window's columns.
+    """Return W independent rows, channels first, and names (W,) of the raw window's columns.
 
     A row that the rows before it imply adds nothing and is left out: a motor's speed beside those of its wheels.  The
     raw window has a channel in the column of the first of its wheels that no channel of fewer wheels has.
@@ -210,7 +210,7 @@ def _independent(rows: Sequence[Row], weight: Array) -> bool:
 
 
 def contrast(n_wheels: int, one: Sequence[int], other: Sequence[int], scale: Array) -> tuple[float, ...]:
-    """Weights (W,) of mean(scale x) over one set of wheels less that over the other."""
+    """Return the weights (W,) of mean(scale x) over one set of wheels less that over the other."""
     weight = np.zeros(n_wheels)
     weight[list(one)] = scale[list(one)] / len(one)
     weight[list(other)] = -scale[list(other)] / len(other)
@@ -218,12 +218,12 @@ def contrast(n_wheels: int, one: Sequence[int], other: Sequence[int], scale: Arr
 
 
 def unit(n_wheels: int, wheel: int) -> tuple[float, ...]:
-    """Weights (W,) of one wheel alone."""
+    """Return the weights (W,) of one wheel alone."""
     return tuple(float(w == wheel) for w in range(n_wheels))
 
 
 def completed(window: Window, rig: Rig) -> Window:
-    """A forward window with a torque, speed and load of every wheel.
+    """Return a forward window with a torque, speed and load of every wheel.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
 
 
 def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
-    """A completed window with other speeds (N, W) of the wheels."""
+    """Return a completed window with other speeds (N, W) of the wheels."""
     given, observations = rig.instrumentation, window.observations
     if given is not None and observations is not None:
         W, value = len(rig.wheels), observations.value.copy()
@@ -424,7 +424,7 @@ def _knows_inertia(window: Window, rig: Rig) -> NDArray[np.bool_]:
 
 
 def unknown_draft(most: Any) -> tuple[Any, Any]:
-    """Mean and sd [N] of a draft of which only a bound is known: any from 0 to it is as likely."""
+    """Return mean and sd [N] of a draft that is anywhere from 0 to its bound."""
     return most / 2.0, most / math.sqrt(12.0)
 
 
@@ -507,7 +507,7 @@ def _may_be_locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
 
 
 def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:
-    """What the channel of a wheel or axle reads (N,) where the wheels have these values (W, N)."""
+    """Return what the channel of a wheel or axle reads (N,) where the wheels have these values (W, N)."""
     rows: Sequence[Row] = () if rig.instrumentation is None else getattr(rig.instrumentation, quantity, ())
     for row in rows:
         if row.kind == "channel" and row.name == name:

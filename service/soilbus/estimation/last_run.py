@@ -25,7 +25,7 @@ def prior_from_last_run(
     elapsed: float,
     correlation_time: float = ESTIMATOR.tracker.gain_correlation_time,
 ) -> Gaussian:
-    """Joint prior of a run from the posterior of the last one: the soil's prior, and gains drawn back to theirs.
+    """Return the joint prior of a run: the soil's prior, and the last run's gains drawn back to theirs.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def prior_from_last_run(
 
 
 def passes_prior_conflict_test(problem: ObservationModel, soil: SoilPrior, joint_prior: Gaussian) -> bool:
-    """Whether a window's evidence with the gains of the last run is at least that with their prior alone.
+    """Return whether a window is at least as likely with the last run's gains as without them.
 
     A sensor exchanged or calibrated since then has another gain error and fails the test.
     """

@@ -47,7 +47,7 @@ _SOIL = len(PARAMETERS)
 
 
 def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
-    """Mean (4,) and covariance (4, 4) of the form parameters before any data.
+    """Return the mean (4,) and covariance (4, 4) of the form parameters before any data.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class FormPosterior:
 
     @classmethod
     def of(cls, farthest: Sequence[float], n_gains: int) -> FormPosterior:
-        """Before any data: the prior, see `form_prior`."""
+        """Return the form parameters before any data: the prior (`form_prior`)."""
         return cls(np.zeros((_SOIL + n_gains, len(FORM))), *form_prior(farthest))
 
     @property
@@ -82,19 +82,19 @@ class FormPosterior:
 
     @property
     def log_covariance(self) -> Array:
-        """What the form adds to the covariance (6, 6) of the soil's logarithms about their mean."""
+        """Covariance (6, 6) that the open form adds to the soil's logarithms."""
         of_soil = self.by_form[:_SOIL]
         spread = OPEN * self.covariance + OPEN * (1.0 - OPEN) * np.outer(self.mean, self.mean)
         return np.asarray(of_soil @ spread @ of_soil.T)
 
     @property
     def log_shift(self) -> Array:
-        """From the soil's logarithms on the configured form to their mean over all forms (6,)."""
+        """Shift (6,) of the soil's logarithms from the configured form to the mean over all forms."""
         return np.asarray(OPEN * self.by_form[:_SOIL] @ self.mean)
 
 
 def with_form_step(model: WheelModel, step: Array) -> WheelModel:
-    """The model with form parameters that differ from its own by a step (4,)."""
+    """Return the model with form parameters that differ from its own by a step (4,)."""
     peak, by_slip, leave, other = step.tolist()
     share = model.exponential_share
     if model.shear_law == "exponential":  # the same, with a share that can be taken away
@@ -111,7 +111,7 @@ def with_form_step(model: WheelModel, step: Array) -> WheelModel:
 
 
 def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> FormPosterior:
-    """Posterior of the form parameters after a window's fit.
+    """Return the posterior of the form parameters after a window's fit.
 
     Parameters
     ----------

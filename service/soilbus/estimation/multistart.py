@@ -95,7 +95,7 @@ class Fit:
 
 
 def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Fit | None:
-    """Posterior of a window of which only the prior is known, from several starts.
+    """Return the posterior of a window of which only the prior is known, from several starts.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
 
 
 class WarmStart(NamedTuple):
-    """A window at the optimum of the window before; its quadratic model there, None where that is not finite."""
+    """Start at the optimum of the window before, with its quadratic model; None where that is not finite."""
 
     objective: Objective
     iterate: Iterate
@@ -130,7 +130,7 @@ class WarmStart(NamedTuple):
 def warm_start(
     problem: ObservationModel, prior: SoilPrior, last: Fit, joint_prior: Gaussian | None = None
 ) -> WarmStart:
-    """A window at the optimum of the window before."""
+    """Return the start of a window at the optimum of the window before."""
     objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior)
     soil = np.where(prior.log_std > 0.0, last.optimum.soil, prior.median)
     with np.errstate(all="ignore"):
@@ -139,7 +139,7 @@ def warm_start(
 
 
 def fit_warm(start: WarmStart) -> Fit | None:
-    """Fit from a warm start; None where the numbers are not finite."""
+    """Descend from a warm start; None where the numbers are not finite."""
     objective, model = start.objective, start.model
     with np.errstate(all="ignore"):
         step = None if model is None else model.step()
@@ -154,7 +154,7 @@ def fit_warm(start: WarmStart) -> Fit | None:
 
 
 def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
-    """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, the second likeliest.
+    """Yield the joint prior's soil (else the prior median), the likeliest soil of the table, loam, the next one.
 
     See `soil_classes.ranked_by_likelihood`.
     """
@@ -166,7 +166,7 @@ def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gau
 
 
 def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
-    """The soil with held parameters at their values and the others within the prior's 95 % interval."""
+    """Return the soil with held parameters at their values and the others in the prior's 95 % interval."""
     factor = np.exp(NORMAL_95 * prior.log_std)
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
@@ -215,7 +215,7 @@ def _joint_fit(objective: Objective, end: _End) -> Fit | None:
 
 
 def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluations: int = 0) -> Fit | None:
-    """The fit at the end of a descent, after evaluations of the model before it; None where it is not finite."""
+    """Return the fit at the end of a descent, after evaluations of the model before it; None where it is not finite."""
     if end.model is None:
         return None
     inverse = solve_with_inverse(end.model.information, end.model.gradient)

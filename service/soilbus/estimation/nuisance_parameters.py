@@ -22,7 +22,7 @@ from soilbus.terra.effects.effect import Active, Effect, Parameter
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """A free parameter of an effect, of one wheel (its number) or of all (None), with value and sd of its prior."""
+    """Free parameter of an effect, of one wheel (its number) or of all (None), with value and sd of its prior."""
 
     effect: str
     parameter: Parameter
@@ -43,22 +43,22 @@ class Free:
         return self.standardised(self.parameter.low), self.standardised(self.parameter.high)
 
     def standardised(self, value: float) -> float:
-        """The standardised u of a value; the inverse of `at`, for a parameter with prior sd > 0."""
+        """Return the standardised u of a value, the inverse of `at`; needs a prior sd above 0."""
         return (value - self.value) / self.std
 
     def at(self, u: float) -> float:
-        """The value at a standardised u, clipped to the parameter's range."""
+        """Return the value at a standardised u, clipped to the parameter's range."""
         return min(max(self.value + self.std * u, self.parameter.low), self.parameter.high)
 
 
 def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
-    """The parameters of an effect at their neutral values, with the catalogue's prior sd."""
+    """Return the parameters of an effect at their neutral values, with the catalogue's prior sd."""
     wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
     return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
 
 
 def active_at(effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int) -> list[Active]:
-    """The effects with their values at standardised parameters (P,).
+    """Return the effects with their values at standardised parameters (P,).
 
     Effects without any influence at these values are left out, to save time.
 
@@ -85,7 +85,7 @@ def active_at(effects: Sequence[Effect], free: Sequence[Free], standardised: Arr
 def active_with_derivatives(
     effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int
 ) -> list[Active]:
-    """As `active_at`; values of parameters with prior sd > 0 are Duals, with the derivative by u number i at key i."""
+    """Return the effects as `active_at`, with derivatives by the standardised parameters (as Duals)."""
     numbers = [
         Dual(f.at(u), {i: f.std}) if f.std > 0.0 else f.at(u)
         for i, (f, u) in enumerate(zip(free, standardised.tolist(), strict=True))

@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class MeasurementOptions:
-    """Which instants of a window are usable, and how their forces are computed."""
+    """Tuning values: which instants of a window are usable, and how their forces are computed."""
 
     load_tolerance: float = 0.02
     """Relative error of load [1] accepted in the first entry angles; each linearisation reduces it further."""
@@ -66,7 +66,7 @@ class MeasurementOptions:
 
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
-    """Numbers of a descent."""
+    """Limits and tolerances of a descent."""
 
     max_evaluations: int = 40
     """Of the model.  Joint descents of 42 windows from random soils take 9 in the mean, 1 in 100 more than 30."""
@@ -126,7 +126,7 @@ class SearchOptions:
 
 @dataclass(frozen=True, slots=True)
 class PosteriorOptions:
-    """What a fit's posterior is: moments, form, soil classes."""
+    """How a fit becomes a posterior: form of the contact, soil classes."""
 
     max_log_variance: float = 4.0
     """Variance of a parameter's logarithm [1] from which it is open, in what is reported: one that may be anywhere
@@ -143,7 +143,7 @@ class PosteriorOptions:
 
 @dataclass(frozen=True, slots=True)
 class TrackerOptions:
-    """Changes of the soil, and what one window's posterior is for the next; a window is `Settings.window` long."""
+    """When the soil has changed, and how one window's posterior is the next one's prior."""
 
     instant: float = 0.25
     """Length of an instant [s], over which bins are averaged: tyres that relax over 0.3 m at 1.2 m/s take as long.
@@ -185,7 +185,7 @@ class TrackerOptions:
 
 @dataclass(frozen=True, slots=True)
 class StandingOptions:
-    """Prior sd of the standing parts of every model (`standing`); 0 holds one at none."""
+    """Prior sd of the parts that stand in every model (`standing`); 0 holds one at none."""
 
     relaxation_length: float = 0.1
     """[m]: tyres relax over 0.05 to 0.3 m (Pacejka 2012, ch. 7)."""
@@ -209,7 +209,7 @@ HELD = StandingOptions(0.0, 0.0, StandingOptions().wheel_mass_share, 0.0, 0.0, 0
 
 @dataclass(frozen=True, slots=True)
 class VarianceOptions:
-    """How variance components are learned from residuals (`variance_components`)."""
+    """Tuning values: how variance components are learned from residuals (`variance_components`)."""
 
     block: float = 1.0
     """Length of a block [s]: an axle bounces at 1.5 to 3 Hz, so that a second holds whole cycles of it."""
@@ -226,7 +226,7 @@ class VarianceOptions:
 
 @dataclass(frozen=True, slots=True)
 class EstimatorOptions:
-    """All of them."""
+    """All tuning values of the estimator."""
 
     measurements: MeasurementOptions = MeasurementOptions()
     search: SearchOptions = SearchOptions()

@@ -59,7 +59,7 @@ class Coordinates:
         return self.prior.free
 
     def position(self, soil: Array) -> Array:
-        """Coordinates (F,) of a soil (6,) in SI."""
+        """Return the coordinates (F,) of a soil (6,) in SI."""
         logs = np.log(soil[self.free])
         if _K_PHI in self._column:
             k_c, k_phi, n = soil[:3].tolist()
@@ -67,7 +67,7 @@ class Coordinates:
         return logs
 
     def soil_at(self, position: Array) -> Array:
-        """The soil (6,) in SI with these coordinates (F,), clipped to the bounds."""
+        """Return the soil (6,) in SI with these coordinates (F,), clipped to the bounds."""
         free = self.free
         soil = self.prior.median.copy()
         soil[free] = np.exp(position)
@@ -77,7 +77,7 @@ class Coordinates:
         return self.within(soil)
 
     def log_directions(self, soil: Array) -> Array:
-        """Derivatives (6, F) of the parameters' logarithms by the coordinates; kept for the next call with it."""
+        """Return the derivatives (6, F) of the parameters' logarithms by the coordinates."""
         last_soil, directions = self._last_directions
         if last_soil is soil:
             return directions
@@ -95,7 +95,7 @@ class Coordinates:
         return directions
 
     def curvature(self, gradient: Array) -> Array:
-        """Curvature (F, F) that the coordinates themselves add to the objective.
+        """Return the curvature (F, F) that the coordinates themselves add to the objective.
 
         Parameters
         ----------
@@ -114,7 +114,7 @@ class Coordinates:
         return curvature
 
     def stepped(self, soil: Array, step: Array) -> Array:
-        """The soil (6,) after a step (F,), which is shortened to `max_log_step`.
+        """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`.
 
         c and tan phi change linearly: along c + p tan phi, which a window at one pressure p measures alone, a step in
         logarithms would leave the valley.
@@ -130,7 +130,7 @@ class Coordinates:
         return self.within(new)
 
     def step_fraction(self, soil: Array, step: Array) -> float:
-        """Fraction of a step (F,) from a soil (6,) within the bounds and `max_log_step`, 1 at most."""
+        """Return the fraction of a step (F,) from a soil (6,) within the bounds and `max_log_step`, 1 at most."""
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
@@ -144,13 +144,13 @@ class Coordinates:
         return min(longest, step_fraction_within(room, change))
 
     def within(self, soil: Array) -> Array:
-        """The soil (6,) with its free parameters clipped to the bounds, in place."""
+        """Return the soil (6,) with its free parameters clipped to the bounds, in place."""
         low, high = self._bounds
         soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
         return soil
 
     def active_bounds(self, soil: Array) -> Array:
-        """Outward directions (E, F) of the bounds that a soil (6,) is at."""
+        """Return the outward directions (E, F) of the bounds that a soil (6,) is at."""
         sides = at_bounds(np.log(soil[self.free]), *self._log_bounds)
         if not sides.any():
             return np.zeros((0, len(sides)))
@@ -185,12 +185,12 @@ class Coordinates:
 
 
 def at_bounds(value: Array, low: Array, high: Array) -> Array:
-    """1.0 or -1.0 (M,) where a value (M,) is at its upper or lower bound (M,), else 0.0."""
+    """Return 1.0 or -1.0 (M,) where a value (M,) is at its upper or lower bound (M,), else 0.0."""
     return np.subtract(value >= high - BOUND_TOLERANCE, value <= low + BOUND_TOLERANCE, dtype=float)
 
 
 def step_fraction_within(room: Array, step: Array) -> float:
-    """Fraction of a step (M,), 1 at most, that stays within the signed distances (M,) to the bounds; inf: no bound."""
+    """Return the fraction of a step (M,), 1 at most, that stays within distances (M,) to the bounds."""
     crosses = np.abs(step) > np.abs(room) + BOUND_TOLERANCE
     if not crosses.any():
         return 1.0

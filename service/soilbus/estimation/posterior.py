@@ -47,14 +47,14 @@ NORMAL_95 = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class SoilPrior:
-    """Log-normal prior of the parameters: median (6,) in SI and sd of the logarithm (6,); sd 0 holds the parameter."""
+    """Log-normal prior: median (6,) in SI and sd of the logarithm (6,); sd 0 holds the parameter."""
 
     median: Array
     log_std: Array
 
     @classmethod
     def from_value_std(cls, values: Mapping[str, tuple[float, float]]) -> SoilPrior:
-        """From value and std of each parameter.
+        """Return the prior from value and std of each parameter.
 
         Parameters
         ----------
@@ -111,7 +111,7 @@ class Posterior:
     log_covariance: Array
 
     def parameters(self) -> dict[str, Estimate]:
-        """Each parameter with its median and the root mean square deviation from it.
+        """Return each parameter with its median and the root mean square deviation from it.
 
         Notes
         -----
@@ -125,7 +125,7 @@ class Posterior:
         return {n: Estimate(v, v * r) for n, v, r in zip(PARAMETERS, self.soil, relative.tolist(), strict=True)}
 
     def propagate(self, gradient: Array) -> float:
-        """Sd of a scalar with this gradient (6,) by the parameters in SI: first order, but for the spread of c."""
+        """Return the sd of a scalar with this gradient (6,) by the parameters, to first order."""
         variance = float(self._covariance((gradient * np.asarray(self.soil))[None])[0, 0])
         return math.sqrt(max(variance, 0.0))  # rounding may take it below zero
 
@@ -144,19 +144,19 @@ class Posterior:
         return np.asarray(covariance + np.outer(along, along) * (square - v))
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> Estimate:
-        """Pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
+        """Return the pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
         return self._estimate(bearing_pressure(self.soil, z_ref, b_ref))
 
     def tan_phi(self) -> Estimate:
-        """Tangent of the internal friction angle."""
+        """Return the tangent of the internal friction angle."""
         return self._estimate(tan_phi(self.soil))
 
     def shear_strength(self, pressure: float) -> Estimate:
-        """Strength c + p tan phi [Pa] below a pressure p [Pa]."""
+        """Return the strength c + p tan phi [Pa] below a pressure p [Pa]."""
         return self._estimate(shear_strength(self.soil, pressure))
 
     def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
-        """The posterior with a covariance of the logarithms added, as by considered parameters.
+        """Return the posterior with a covariance of the logarithms added, as by considered parameters.
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class Posterior:
         return Posterior(Soil(*(np.asarray(self.soil) * np.exp(logs)).tolist()), covariance)
 
     def distance(self, soil: Soil) -> float:
-        """Mahalanobis distance of a soil, in sd, by all free parameters together."""
+        """Return the Mahalanobis distance of a soil, in sd, by all free parameters together."""
         free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
         off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
         return math.sqrt(max(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)), 0.0))
@@ -194,20 +194,20 @@ class Posterior:
 
 
 def bearing_pressure(soil: Soil, z_ref: float, b_ref: float) -> Scalar:
-    """Pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (eq. 3 of Xi et al. 2024)."""
+    """Return the pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (eq. 3 of Xi et al. 2024)."""
     value = soil.bearing_pressure(z_ref, b_ref)
     by_modulus = z_ref**soil.n
     return Scalar(value, np.array([by_modulus / b_ref, by_modulus, value * np.log(z_ref), 0.0, 0.0, 0.0]))
 
 
 def tan_phi(soil: Soil) -> Scalar:
-    """Tangent of the internal friction angle."""
+    """Return the tangent of the internal friction angle."""
     tan = float(np.tan(soil.phi))
     return Scalar(tan, np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0]))
 
 
 def shear_strength(soil: Soil, pressure: float) -> Scalar:
-    """Shear strength c + p tan phi [Pa] of the soil below a pressure p [Pa] (Mohr-Coulomb)."""
+    """Return the shear strength c + p tan phi [Pa] of the soil below a pressure p [Pa] (Mohr-Coulomb)."""
     tangent = tan_phi(soil)
     return Scalar(
         soil.c + pressure * tangent.value, pressure * tangent.gradient + np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -215,6 +215,6 @@ def shear_strength(soil: Soil, pressure: float) -> Scalar:
 
 
 def tyre_modulus(soil: Soil, width: float) -> Scalar:
-    """Lumped modulus K_L [N/m^(n+2)] under a tyre of this width [m] (eq. 35 of Xi et al. 2024)."""
+    """Return the lumped modulus K_L [N/m^(n+2)] under a tyre of this width [m] (eq. 35 of Xi et al. 2024)."""
     value = float(lumped_modulus(soil.k_c, soil.k_phi, width))
     return Scalar(value, np.array([1.0 / width, 1.0, 0.0, 0.0, 0.0, 0.0]))

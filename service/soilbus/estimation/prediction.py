@@ -18,7 +18,7 @@ from soilbus.estimation.variance_components import block_sums
 
 
 class Share(NamedTuple):
-    """Sums of squares of errors beyond noise and of what was predicted, in the units of the channel squared."""
+    """Sums of squares of prediction errors beyond noise, and of what was predicted."""
 
     error: float
     size: float

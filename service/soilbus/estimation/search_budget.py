@@ -47,13 +47,13 @@ class SearchBudget:
         self.ended = False
 
     def next_window(self, instants: int, refill: bool = False) -> None:
-        """A window of N instants begins; refill: the model described recent data, so the bucket is filled."""
+        """Begin a window of N instants; `refill` fills the bucket, where the model described recent data."""
         self._remaining = self._burst if refill else min(self._remaining + self._rate, self._burst)
         self._window = max(instants, 1)
         self.ended = False
 
     def allows(self) -> bool:
-        """Whether evaluations remain for a search; if not, `ended` is set."""
+        """Return whether evaluations remain for a search; if not, set `ended`."""
         self.ended = self.ended or self._remaining <= 0.0
         return self._remaining > 0.0
 

@@ -52,7 +52,7 @@ _K_C = PARAMETERS.index("k_c")
 
 @dataclass(frozen=True)
 class SoilClasses:
-    """C classes of soil in the coordinates of tyres of a mean width.
+    """Classes of soil in the coordinates of tyres of a mean width.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class SoilClasses:
 
     @classmethod
     def of_table(cls, width: float) -> SoilClasses:
-        """Every kind of the table, and `unknown`, for tyres of a mean width [m]."""
+        """Return every kind of the table, and `unknown`, for tyres of a mean width [m]."""
         everything = Coordinates(SoilPrior(np.ones(len(PARAMETERS)), np.ones(len(PARAMETERS))), width)
         known = np.array([everything.position(np.asarray(SOILS[name])) for name in KINDS])
         within = np.array([WITHIN_CLASS_SD[name] for name in PARAMETERS])
@@ -80,7 +80,7 @@ class SoilClasses:
         return cls((*KINDS, UNKNOWN), np.vstack([known, known.mean(axis=0)]), spread, width)
 
     def probabilities(self, posterior: Posterior, guess: SoilPrior) -> dict[str, float]:
-        """Probability of each class given a window's posterior.
+        """Return the probability of each class given a window's posterior.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class SoilClasses:
 
 
 def guessed(prior: SoilPrior, default: SoilPrior) -> SoilPrior:
-    """The part of a prior that is only a guess: where it equals the default.
+    """Return the prior, made vague where it differs from the default: there somebody knows the field.
 
     Where it differs, somebody who knows the field has set it.
     """
@@ -159,7 +159,7 @@ def _evidence(posterior: Posterior, guess: SoilPrior, width: float, scale: Array
 
 
 def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> list[Soil]:
-    """Soils of the table by their likelihood, the best first.
+    """Return the soils of the table by their likelihood, the best first.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ __all__ = ["ChangePoint", "Reason", "Shown", "SoilState", "TrackerState", "next_
 
 
 class TrackerState(StrEnum):
-    """Which soil a window's estimate is of."""
+    """Soil that a window's estimate is of: the same, another, or undecided."""
 
     STEADY = "steady"
     """The soil of the windows before."""
@@ -32,7 +32,7 @@ class TrackerState(StrEnum):
 
 
 class Reason(StrEnum):
-    """Why a window has its state."""
+    """Reason for a window's TrackerState."""
 
     ONE_SOIL = "one_soil"
     """Its data agree with the soil of the windows before (steady)."""
@@ -64,7 +64,7 @@ class ChangePoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SoilState:
-    """Which soil the windows are of.
+    """State of the tracker: which soil the windows are of.
 
     Attributes
     ----------
@@ -85,13 +85,13 @@ class SoilState:
     mismatch: bool = False
 
     def spans_border(self, start: float) -> bool:
-        """Whether a window from `start` [s] on may still have data of another soil."""
+        """Return whether a window from `start` [s] on may still have data of another soil."""
         is_open = self.name is TrackerState.TRANSITION and self.mismatch
         return self.transition is not None and (is_open or start < self.transition.end)
 
 
 class Shown(NamedTuple):
-    """What a window shows.
+    """What a window tells of a change of soil.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Shown(NamedTuple):
 
 
 def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
-    """State after a window that ended at `end` [s], of length `window` [s].
+    """Return the state after a window that ended at `end` [s], of length `window` [s].
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ _SOIL = len(PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class Iterate:
-    """A point of a descent: soil (6,) in SI, gains (G,) and latents."""
+    """Point of a descent: soil (6,) in SI, gains (G,) and latents."""
 
     soil: Array
     gains: Array
@@ -49,11 +49,11 @@ class Iterate:
 
     @classmethod
     def of(cls, optimum: Optimum) -> Iterate:
-        """The end point of a fit."""
+        """Return the end point of a fit."""
         return cls(optimum.soil, optimum.gains, optimum.latents)
 
     def as_soil(self) -> Soil:
-        """The soil by name."""
+        """Return the soil by name."""
         return Soil(*self.soil.tolist())
 
 
@@ -85,7 +85,7 @@ class QuadraticModel:
     active_bounds: Array
 
     def step(self) -> Array | None:
-        """The step (F + A,) to the model's minimum within the active bounds; None where there is no minimum.
+        """Return the step (F + A,) to the model's minimum within the active bounds; None where there is no minimum.
 
         A step that would cross an active bound goes along it, to the least value there.
         """
@@ -105,13 +105,13 @@ class QuadraticModel:
 
     @property
     def neg2_log_evidence(self) -> float:
-        """-2 log of the data's likelihood with the parameters integrated out (Laplace), up to the same constant."""
+        """-2 log evidence (Laplace): the data's likelihood with the parameters integrated out."""
         return self.neg2_log_posterior + float(
             np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.prior_information)[1]
         )
 
     def squared_length(self, step: Array) -> float:
-        """Squared length of a step (F + A,) in posterior sd; of a full step it is the predicted decrease."""
+        """Return the squared length of a step (F + A,) in posterior sd; of a full step it is the predicted decrease."""
         return float(step @ self.information @ step)
 
 
@@ -143,12 +143,12 @@ class GaussianApproximation(NamedTuple):
     covariance: Array
 
     def explained(self, mixed: Array) -> tuple[Array, Array]:
-        """What soil and gains take up of gradient (K,) and information (K, K) of further unknowns; mixed (K, F + A)."""
+        """Return what soil and gains explain of gradient (K,) and information (K, K) of other unknowns."""
         return mixed @ self.step, mixed @ self.covariance @ mixed.T
 
 
 def coordinates_of(problem: ObservationModel, prior: SoilPrior) -> Coordinates:
-    """The coordinates of a window's free parameters."""
+    """Return the coordinates of a window's free parameters."""
     return Coordinates(prior, float(problem.rig.width.mean()), problem.options.search)
 
 
@@ -198,13 +198,13 @@ class Objective:
         self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
 
     def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
-        """The same window under another joint prior."""
+        """Return the same window under another joint prior."""
         return Objective(self.problem, self.coordinates.prior, joint_prior)
 
     # Iterates
 
     def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
-        """An iterate with the latents as measured.
+        """Return an iterate with the latents as measured.
 
         Parameters
         ----------
@@ -219,13 +219,13 @@ class Objective:
         return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains))
 
     def start_near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
-        """Soil (6,) and gains (G,) with these latents where they are of this window's instants, else as measured."""
+        """Return an iterate with these latents where they are of this window's instants, else as measured."""
         if latents is None or latents.load.shape != (self.problem.n, self.problem.n_wheels):
             return self.start(soil, gains=gains)
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
-        """The iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
+        """Return the iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
         free = len(self.free)
         step = self.step_fraction(iterate, step) * step
         soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), iterate.gains.copy()
@@ -235,7 +235,7 @@ class Objective:
         return self.moved(iterate, model.linearisation, soil, gains)
 
     def moved(self, iterate: Iterate, at: Linearisation, soil: Array, gains: Array) -> Iterate:
-        """The iterate of another soil (6,) and gains (G,), with latents as the linear model at this one predicts them.
+        """Return the iterate of another soil (6,) and gains (G,), with latents by the linear model.
 
         Entry angles that change far are solved.
         """
@@ -251,12 +251,12 @@ class Objective:
         return Iterate(soil, gains, new)
 
     def with_entry_angles(self, iterate: Iterate) -> Iterate:
-        """The same iterate with its entry angles solved, after linear predictions in a row."""
+        """Return the same iterate with its entry angles solved, after linear predictions in a row."""
         latents = self.problem.with_entry_angles(iterate.latents, iterate.as_soil(), iterate.gains)
         return replace(iterate, latents=latents)
 
     def step_fraction(self, iterate: Iterate, step: Array) -> float:
-        """Largest fraction of a step (F + A,), 1 at most, within the bounds and step limits."""
+        """Return the largest fraction of a step (F + A,), 1 at most, within the bounds and step limits."""
         free = len(self.free)
         of_soil = self.coordinates.step_fraction(iterate.soil, step[:free])
         if not self._has_gain_bounds:
@@ -280,12 +280,12 @@ class Objective:
     # Residuals, Jacobian, prior: the quadratic model
 
     def quadratic_model(self, iterate: Iterate) -> WindowModel | None:
-        """The quadratic model at an iterate; None where the observation model is not finite there."""
+        """Return the quadratic model at an iterate; None where the observation model is not finite there."""
         linearisation = self.problem.linearise(iterate.as_soil(), iterate.gains, iterate.latents, not self.as_measured)
         return self.with_prior(iterate, linearisation)
 
     def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> WindowModel | None:
-        """The quadratic model from the data's linearisation at an iterate; None where it is not finite."""
+        """Return the quadratic model from the data's linearisation at an iterate; None where it is not finite."""
         free = len(self.free)
         directions = self.directions(iterate)
         if self.as_measured:
@@ -308,7 +308,7 @@ class Objective:
         )
 
     def prior_at(self, iterate: Iterate) -> PriorQuadratic:
-        """The prior's quadratic at an iterate; kept for the next call with the same soil and gains."""
+        """Return the prior's quadratic at an iterate, and keep it for the next call with the same one."""
         last = self._prior_cache
         if last is None or last[0] is not iterate.soil or last[1] is not iterate.gains:
             by_logs = self._identity.copy()
@@ -318,7 +318,7 @@ class Objective:
         return last[2]
 
     def directions(self, iterate: Iterate) -> Array:
-        """Derivatives (1 + 6 + G, F + A) of (1, soil in SI, gains) by free coordinates and active gains.
+        """Return the derivatives (1 + 6 + G, F + A) of (1, soil, gains) by free coordinates and active gains.
 
         So Linearisation.rows times `directions` is the residuals' Jacobian.
         """
@@ -327,20 +327,20 @@ class Objective:
         return directions
 
     def parameter_jacobian(self, soil: Array) -> Array:
-        """Derivatives (6 + G, F + A) of the soil's logarithms and the gains by coordinates and active gains."""
+        """Return the derivatives (6 + G, F + A) of log soil and gains by coordinates and active gains."""
         jacobian = self._gain_directions[1:].copy()
         jacobian[:_SOIL, : len(self.free)] = self.coordinates.log_directions(soil)
         return jacobian
 
     def prior_jacobian(self, optimum: Optimum) -> Array:
-        """Derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
+        """Return the derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
         unknowns = np.concatenate([self.free, _SOIL + self.active])
         return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum.soil)[unknowns])
 
     # Gaussians at an optimum
 
     def approximation_at(self, optimum: Optimum) -> GaussianApproximation | None:
-        """The linear model at an optimum, kept for the next call; None where its information is singular."""
+        """Return the linear model at an optimum; None where its information is singular."""
         if self._approximation is None or self._approximation[0] is not optimum:
             iterate = Iterate.of(optimum)
             directions, prior = self.directions(iterate), self.prior_at(iterate)
@@ -355,7 +355,7 @@ class Objective:
         return self._approximation[1]
 
     def gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
-        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, linearised at `base`."""
+        """Return the Gaussian with this covariance of coordinates and active gains, linearised at `base`."""
         jacobian = self.parameter_jacobian(soil if base is None else base)
         logs = jacobian @ covariance @ jacobian.T
         if base is None:
@@ -365,7 +365,7 @@ class Objective:
 
 
 class Termination(StrEnum):
-    """Why a descent ended."""
+    """Reason why a descent ended."""
 
     STEP = "step"
     """Converged: the next step is predicted to be shorter than the tolerance."""
@@ -389,13 +389,13 @@ class Minimisable(Protocol[PointT, ModelT]):
     """An objective that `minimise` takes: of one window, or of several recordings together."""
 
     def quadratic_model(self, iterate: PointT, /) -> ModelT | None:
-        """The quadratic model at an iterate; None where it is not finite."""
+        """Return the quadratic model at an iterate; None where it is not finite."""
 
     def stepped(self, iterate: PointT, model: ModelT, step: Array, /) -> PointT:
-        """The iterate after a step, shortened at bounds."""
+        """Return the iterate after a step, shortened at bounds."""
 
     def with_entry_angles(self, iterate: PointT, /) -> PointT:
-        """The same iterate with its entry angles solved."""
+        """Return the same iterate with its entry angles solved."""
 
 
 class Solution(NamedTuple, Generic[PointT, ModelT]):

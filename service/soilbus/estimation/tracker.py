@@ -82,6 +82,8 @@ class Settings:
         Time [s] from one window to the next.
     instant : float
         Length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins.
+    stated_noise : bool
+        Whether a first fit that leaves more than the stated noise is a mismatch: of rows without shaking or lateness.
     """
 
     window: float
@@ -94,6 +96,7 @@ class Settings:
     search_burst: float = 100.0
     hop: float = 1.0
     instant: float = ESTIMATOR.tracker.instant
+    stated_noise: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +203,7 @@ class Tracker:
 
     @property
     def instant(self) -> float:
-        """Length [s] of an instant; 0, bins as they are, on tracks alone: no tyre relaxes or bounces."""
+        """Length [s] of an instant; 0 (bins as they are) on tracks, where no tyre relaxes or bounces."""
         lengths = self.rig.lengths
         return 0.0 if lengths is not None and (lengths > 0.0).all() else self.settings.instant
 
@@ -219,7 +222,7 @@ class Tracker:
         self._last_run = gaussian, elapsed
 
     def start_from(self, other: Tracker, t: float) -> None:
-        """Take the soil that another tracker knows as prior from `t` [s] on: the machine changed, not the ground."""
+        """Take the soil that another tracker knows as prior from `t` [s] on, as when the machine changes."""
         known = other.newest_posterior
         if known is None:
             return
@@ -242,7 +245,7 @@ class Tracker:
 
     @property
     def components(self) -> VarianceComponents:
-        """What each kind of sensor is worth, by the windows so far."""
+        """Variance components of the sensors, learned from the windows so far."""
         return self._components
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
@@ -274,7 +277,7 @@ class Tracker:
             return TrackerOutput(None, False, TrackerState.STEADY, present.since, *left_out, reason=Reason.TOO_FEW_DATA)
         self._discard_before(end - self.settings.window)
         one = self._one_soil(present)
-        if not self._components.weight:
+        if not self._components.weight and not (self.settings.stated_noise and self.mismatch(one.fit)):
             present, one = self._with_components(present, window, end, one)
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)
@@ -475,7 +478,7 @@ class Tracker:
         return fit
 
     def mismatch(self, fit: Fit | None) -> bool:
-        """Whether a fit failed, or fits much worse than the windows before: its data may be of several soils."""
+        """Return whether a fit failed, or fits much worse than the windows before, as on several soils."""
         return fit is None or not fit.converged or self.is_of_several_soils(fit)
 
     def is_of_several_soils(self, fit: Fit) -> bool:
@@ -559,12 +562,12 @@ class Tracker:
 
 
 def new_soil_prior(prior: SoilPrior) -> SoilPrior:
-    """Prior of a new soil: log sd at least the spread of the soils in `terra.soils`; held parameters stay held."""
+    """Return the prior of a new soil, at least as wide as the soils in `terra.soils`; held parameters stay."""
     soils = np.log(list(SOILS.values()))
     return SoilPrior(prior.median, np.where(prior.log_std > 0.0, np.maximum(prior.log_std, soils.std(0)), 0.0))
 
 
 def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list[str], Array]:
-    """Names and prior sd (G,) of a vehicle's nuisance parameters: sensor gains, then effect parameters."""
+    """Return names and prior sd (G,) of the nuisance parameters: sensor gains, then effect parameters."""
     problem = ObservationModelWithEffects(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
     return problem.gain_names, problem.gain_std

@@ -106,7 +106,7 @@ class Rig:
 
     @property
     def length(self) -> Array | float:
-        """Contact lengths [m] (W,); the number 0 where all are wheels, which then cost what wheels cost."""
+        """Contact lengths [m] (W,); the number 0 where all are wheels."""
         return 0.0 if self.lengths is None else self.lengths
 
     @property
@@ -120,7 +120,7 @@ class Rig:
 
     @property
     def front(self) -> NDArray[np.bool_]:
-        """(W,), which wheels are on the front axle."""
+        """Which wheels are on the front axle (W,)."""
         return np.asarray(self.ahead == 1.0)
 
     @property
@@ -130,7 +130,7 @@ class Rig:
 
     @property
     def drives(self) -> NDArray[np.bool_]:
-        """(W,), which wheels a motor can drive."""
+        """Which wheels a motor can drive (W,)."""
         return np.ones(len(self.wheels), bool) if self.driven is None else self.driven
 
 
@@ -173,7 +173,7 @@ class Window:
                 object.__setattr__(self, quantity, np.full(len(self.t), np.nan))
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Window:
-        """The window with the given bins only; a slice copies nothing."""
+        """Return the window with the given bins only; a slice copies nothing."""
         values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
         return replace(
             self,
@@ -186,7 +186,7 @@ class Window:
 
 
 def forward(window: Window) -> Window:
-    """The window with every instant of reversing turned into the same drive forward.
+    """Return the window with every instant of reversing turned into the same drive forward.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def forward(window: Window) -> Window:
 
 
 def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
-    """Whether the vehicle turns too sharply for one ground speed, at each instant (N,) of a forward window.
+    """Return whether the vehicle turns too sharply for one ground speed, at each instant (N,) of a forward window.
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:
 
 
 def pairs(rig: Rig) -> NDArray[np.intp]:
-    """Left and right wheels (2, P) of the axles that have two; the left one is configured first."""
+    """Return the left and right wheels (2, P) of the axles that have two; the left one is configured first."""
     return _pairs(tuple(rig.ahead.tolist()))
 
 
@@ -338,7 +338,7 @@ class NoiseTable(NamedTuple):
 
     @classmethod
     def of(cls, rig: Rig) -> NoiseTable:
-        """The noise of a rig's channels."""
+        """Return the noise of a rig's channels."""
         noise = [rig.noise.get(name.partition(".")[0], SensorNoise()) for name in rig.channels]
         return cls(
             len(rig.wheels),
@@ -349,12 +349,12 @@ class NoiseTable(NamedTuple):
         )
 
     def of_samples(self, values: Array, column: int) -> Array:
-        """Variances (N,) of samples (N,) of the channel in this column."""
+        """Return the variances (N,) of samples (N,) of the channel in this column."""
         fixed = self.variance[column] + (self.of_mean[column] * np.abs(values).mean()) ** 2
         return np.asarray(fixed + (self.relative[column] * values) ** 2)
 
     def sd(self, count: NDArray[np.intp], size: Array, level: Array) -> Array:
-        """Sd (N,) of samples with magnitudes `size` (N,), sorted by channel.
+        """Return the sd (N,) of samples with magnitudes `size` (N,), sorted by channel.
 
         Parameters
         ----------
@@ -375,7 +375,7 @@ class NoiseTable(NamedTuple):
 
 
 def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, samples: int) -> Window:
-    """A window from bin means.
+    """Return a window from bin means.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ def _variance_of_means(mean: Array, count: Array, noise: NoiseTable) -> Array:
 
 
 def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: Sequence[str] = ()) -> Window:
-    """A window whose rows are single samples of the named channels (tables, tests); t [s] (N,), samples by channel."""
+    """Return a window whose rows are single samples of the named channels; t [s] (N,)."""
     mean = np.full((len(t), len(rig.channels)), np.nan)
     for i, name in enumerate(rig.channels):
         if name in samples and (not names or name in names):
@@ -427,12 +427,12 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
 
 
 def zero_if_unknown(values: Array) -> Array:
-    """The values with 0 in place of nan."""
+    """Return the values with 0 in place of nan."""
     return np.where(np.isnan(values), 0.0, values)
 
 
 def steady(window: Window) -> Window:
-    """The window with pitch, roll and acceleration on lines between the bins that have them, constant outside.
+    """Return the window with gaps of pitch, roll and acceleration filled by straight lines.
 
     For what is to be known in every bin: loads, demand, warning.  A slope does not end where its sensor has no sample.
     """
@@ -448,15 +448,15 @@ def steady(window: Window) -> Window:
 
 
 def pull_asked(window: Window, chassis: Chassis) -> Array:
-    """Pull [N] (N,) that draft and slope ask of the wheels; nan without draft, level where no pitch is known."""
+    """Return the pull [N] (N,) that draft and slope ask of the wheels; nan without draft, level without pitch."""
     return np.asarray(pull_required(chassis, window.draft, zero_if_unknown(window.pitch), 0.0))
 
 
 def pull_given(window: Window, chassis: Chassis) -> Array:
-    """As `pull_asked`, plus the force that accelerates the vehicle where acceleration is known."""
+    """Return `pull_asked` plus the force that accelerates the vehicle where acceleration is known."""
     return pull_asked(window, chassis) + inertia_of(window, chassis)
 
 
 def inertia_of(window: Window, chassis: Chassis) -> Array:
-    """Force [N] (N,) that accelerates the vehicle; 0 where acceleration is unknown."""
+    """Return the force [N] (N,) that accelerates the vehicle; 0 where acceleration is unknown."""
     return np.asarray(chassis.mass * zero_if_unknown(window.acceleration))

@@ -21,7 +21,7 @@ Kind = Literal["text", "number", "integer", "truth", "time"]
 
 
 class Column(NamedTuple):
-    """Kind of a value, and its unit: "1" of a ratio, count or probability, "" of what is no number.
+    """Kind of a value and its unit: "1" of a ratio, count or probability, "" of no number.
 
     A `time` is an integer, milliseconds since 1970 (UTC).
     """
@@ -117,11 +117,11 @@ _COLUMNS: tuple[tuple[str, Column], ...] = (
 
 @cache
 def column(key: str) -> Column | None:
-    """Kind and unit of a key; None where it is no key of a record."""
+    """Return the kind and unit of a key; None where it is no key of a record."""
     return next((found for pattern, found in _COLUMNS if fnmatchcase(key, pattern)), None)
 
 
 @cache
 def is_part(key: str) -> bool:
-    """Whether a key is that of a part, with values below it, as `soil`, which is null in an invalid window."""
+    """Return whether a key is that of a part with values below it, such as `soil`."""
     return column(key) is None and any(pattern.startswith(f"{key}.") for pattern, _ in _COLUMNS)

@@ -102,7 +102,7 @@ def _messages(result: WindowResult, record: Mapping[str, Any]) -> Iterator[tuple
 
 
 def window_schema(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """The JSON schema of all the records: each key that occurs, with its type and, as description, its unit."""
+    """Return the JSON schema of all the records: each key that occurs, with its type and, as description, its unit."""
     schema: dict[str, Any] = {"title": "soilbus.Window", "type": "object", "properties": {}}
     for record in records:
         for key, value in record.items():

@@ -21,13 +21,13 @@ DEGREE_DECIMALS = 7
 
 
 def check_position_is_mapped(config: Config, option: str) -> None:
-    """Raises ConfigError where what an option asks for could only be empty."""
+    """Raise ConfigError where an option needs a position that is not mapped."""
     if config.signals.latitude is None:
         raise ConfigError([f"{option} needs a position: map signals.latitude and signals.longitude"])
 
 
 def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
-    """A FeatureCollection, one feature a line.
+    """Return a FeatureCollection, one feature a line.
 
     Returns
     -------

@@ -59,7 +59,7 @@ def _cell(value: Any) -> Any:
 
 
 def parquet_of(rows: Rows) -> bytes:
-    """The bytes of a Parquet file; what is not known is null."""
+    """Return the bytes of a Parquet file; what is not known is null."""
     import pyarrow.parquet as pq
 
     out = io.BytesIO()
@@ -68,12 +68,12 @@ def parquet_of(rows: Rows) -> bytes:
 
 
 def table_columns(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Columns of a table of these rows; a part that is null as a whole in all of them is none."""
+    """Return the columns of a table of these rows, without parts that are null in all of them."""
     return [name for name in column_names(rows) if not is_part(name)]
 
 
 def arrow_schema(names: Iterable[str]) -> Any:
-    """The pyarrow schema of these columns, each with its unit, and with the versions of schema and soilbus."""
+    """Return the pyarrow schema of these columns, each with its unit, and with the versions of schema and soilbus."""
     import pyarrow as pa
 
     types = {
@@ -88,7 +88,7 @@ def arrow_schema(names: Iterable[str]) -> Any:
 
 
 def arrow_table(rows: Rows, schema: Any) -> Any:
-    """A pyarrow table of rows under a schema; null where a row has no value of that name."""
+    """Return a pyarrow table of rows under a schema; null where a row has no value of that name."""
     import pyarrow as pa
 
     columns = [pa.array([_as_utf8(row.get(f.name)) for row in rows], f.type) for f in schema]

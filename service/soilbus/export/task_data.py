@@ -44,7 +44,7 @@ LARGEST = 2**31 - 1
 
 
 class Quantity(NamedTuple):
-    """What stands under a DDI: name, unit that people read, value of a step of the integer, decimals to show."""
+    """Meaning of a DDI: name, unit that people read, value of a step of the integer, decimals to show."""
 
     name: str
     unit: str
@@ -65,7 +65,7 @@ QUANTITIES = {
 
 
 def compaction_code(result: WindowResult, bounds: Sequence[float]) -> int:
-    """DDI 470 of a window: 1 to 4 by its bearing pressure between `bounds` [Pa], rising; 0 where it is not valid."""
+    """Return DDI 470 of a window: 1 to 4 by its bearing pressure between `bounds` [Pa]; 0 if not valid."""
     if result.status is not Status.VALID or result.bearing is None:
         return 0
     return 1 + bisect_right(bounds, result.bearing.value)

@@ -78,7 +78,7 @@ MAX_SENT_BYTES = 256 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What came of a batch.
+    """Result of a batch.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Batch:
 
 
 class WorkerLost(Exception):
-    """A worker is gone that kept something for us."""
+    """Error of a worker that is gone with something it kept for us."""
 
 
 # --- Dask
@@ -119,7 +119,7 @@ class WorkerLost(Exception):
 
 @contextmanager
 def cluster(address: str | None, say: Callable[[str], None], processes: int | None = None) -> Iterator[Any]:
-    """A Dask client of the scheduler at an address, or processes of this machine that are used like one.
+    """Give a Dask client of the scheduler at an address, or processes of this machine with the same use.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def workers_watched(
 
 
 def worker_version() -> str:
-    """Version of soilbus on a worker."""
+    """Return the version of soilbus on a worker."""
     return __version__
 
 
@@ -236,7 +236,7 @@ def _other_versions(client: Any) -> list[str]:
 def done_in_turn(
     client: Any, function: Callable[..., Any], tasks: Iterable[tuple[str, tuple[Any, ...]]]
 ) -> Iterator[tuple[str, Any]]:
-    """Results as they come, by key; the exception itself where a task failed.
+    """Yield results as they come, by key; the exception itself where a task failed.
 
     Tasks are drawn one by one as others end, so that what travels with them is never in memory all at once.
 
@@ -277,7 +277,7 @@ def done_in_turn(
 
 
 def check_out(out: Path, resume: bool) -> None:
-    """Raises ConfigError where a folder holds results and no run is resumed, or other files that would be replaced."""
+    """Raise ConfigError where a folder holds results that no run resumes, or other files."""
     if not resume and any((out / "parts").glob("*")):
         raise ConfigError([f"--out {out}: it holds results: go on with --resume, or take another folder"])
     if out.exists() and not out.is_dir():
@@ -290,7 +290,7 @@ def check_out(out: Path, resume: bool) -> None:
 
 @contextmanager
 def results_in(out: Path) -> Iterator[None]:
-    """A folder for results that no other process writes to meanwhile; BatchError where one does, OSError."""
+    """Lock a folder for results; BatchError where another process writes to it, OSError."""
     (out / "parts").mkdir(parents=True, exist_ok=True)
     descriptor = os.open(out, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -397,7 +397,7 @@ def _part_path(parts: Path, digest: str) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What came of a log, as in an Outcome, and the state of its file: size in bytes, time of change [ns]."""
+    """Result of a log, as in an Outcome, and the state of its file: size in bytes, time of change [ns]."""
 
     fault: str | None
     windows: int
@@ -406,7 +406,7 @@ class Kept:
     changed: int | None
 
     def is_of(self, size: int | None, changed: int | None) -> bool:
-        """Whether a file in this state is still the same, as far as its state is known."""
+        """Return whether a file in this state is still the same, as far as its state is known."""
         return size in (self.size, None) and (changed == self.changed or None in (changed, self.changed))
 
 
@@ -520,7 +520,7 @@ def _outcome(job: Job, result: Outcome | BaseException) -> Outcome:
 
 
 def unseen_of(folders: Sequence[str]) -> list[str]:
-    """Those of the folders that are not on this machine."""
+    """Return those of the folders that are not on this machine."""
     return [folder for folder in folders if not Path(folder).is_dir()]
 
 

@@ -50,14 +50,14 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 
 
 class TableError(LogError):
-    """A table cannot be used; the text says in one line where and why."""
+    """Error of a table that cannot be used; one line says where and why."""
 
 
 # --- cells
 
 
 def read_columns(path: Path, needed: Sequence[str] | None) -> Columns:
-    """The cells of the needed columns of a CSV or Parquet file, packed or not; of all columns by default.
+    """Return the cells of the needed columns of a CSV or Parquet file; of all columns by default.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def read_columns(path: Path, needed: Sequence[str] | None) -> Columns:
 
 
 def kind_of(path: Path) -> str:
-    """The end of a file's name in small letters, without that of its packing."""
+    """Return the suffix of a file's name in small letters, without that of its packing."""
     ends = [end.lower() for end in path.suffixes]
     return next((end for end in reversed(ends) if end not in PACKED), "")
 
@@ -107,7 +107,7 @@ def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
 
 
 def separator_of(header: str, names: Collection[str]) -> str:
-    """What separates a table's cells.
+    """Return the separator of a table's cells.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def _parquet(path: Path, needed: Sequence[str] | None) -> Columns:
 
 
 def check_cells(cells: int) -> None:
-    """Raise ValueError where a Parquet file has too many cells for the memory, which its size does not show."""
+    """Raise ValueError where a Parquet file has too many cells for the memory."""
     if cells > LIMITS.whole // LEAST_CELL:
         raise ValueError(f"{cells} cells are too many")
 
@@ -183,7 +183,7 @@ def check_columns(source: Path | str, header: Sequence[str], needed: Sequence[st
 
 
 def number(cell: Any) -> float:
-    """The number of a cell; nan where it is missing, inf for what is no finite number."""
+    """Return the number of a cell; nan where it is missing, inf for what is no finite number."""
     if cell is None or str(cell).strip().lower() in MISSING_CELLS:
         return math.nan
     try:
@@ -227,16 +227,16 @@ class SignalTable:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name of the table in messages."""
         return "standard input" if str(self.path) == "-" else str(self.path)
 
     @property
     def chosen(self) -> str:
-        """No channel: a table has none."""
+        """Channel that is read: none, as a table has none."""
         return ""
 
     def frames(self) -> Iterator[Frame]:
-        """A frame for each cell with something in it; what is no number is one of infinity, to be refused and counted.
+        """Yield a frame for each cell that is not empty; text gives infinity, which is refused and counted.
 
         Raises
         ------
@@ -266,13 +266,13 @@ class SignalTable:
 
 
 def signal_table(config: Config, path: Path) -> SignalTable:
-    """The table of a configuration with [columns]."""
+    """Return the table of a configuration with [columns]."""
     assert config.columns is not None
     return SignalTable(path, config.columns, list(mapped_columns(config)))
 
 
 def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = None) -> dict[str, Samples]:
-    """The samples of a table by column; of all columns with numbers by default.
+    """Return the samples of a table by column; of all columns with numbers by default.
 
     Raises
     ------
@@ -301,7 +301,7 @@ def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = Non
 
 
 def time_column(path: Path) -> str:
-    """The column of a table that its name calls the time; "" where none does, and of MF4, which has its own."""
+    """Return the column of a table that its name calls the time; "" without one, and of MF4."""
     if kind_of(path) == ".mf4":
         return ""
     names = list(read_columns(path, None))

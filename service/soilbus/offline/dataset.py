@@ -58,7 +58,7 @@ _WKB_POINT = np.dtype([("order", "u1"), ("kind", "<u4"), ("x", "<f8"), ("y", "<f
 
 
 def day_files(piece: bytes, columns: Sequence[str]) -> dict[str, bytes]:
-    """Parquet files of a piece of a part, by day.
+    """Return the Parquet files of a piece of a part, by day.
 
     Parameters
     ----------
@@ -89,17 +89,17 @@ def _day(milliseconds: int | None) -> str:
 
 
 def window_columns(summaries: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Columns of all windows: those of every part; the vehicle is in the folder's name."""
+    """Return the columns of the windows of all parts; the vehicle is in the folder's name."""
     return [c for c in table_columns(dict.fromkeys(s["columns"]) for s in summaries) if c != "vehicle"]
 
 
 def folder_of(windows: Path, vehicle: str, day: str) -> Path:
-    """Folder of a vehicle's windows of one day."""
+    """Return the folder of a vehicle's windows of one day."""
     return windows / _vehicle_folder(vehicle) / f"day={day}"
 
 
 def can_be_folder(vehicle: str) -> bool:
-    """Whether a folder can have the name of a vehicle, and readers find it."""
+    """Return whether a folder can have the name of a vehicle, and readers find it."""
     return vehicle.isprintable() and vehicle != HIVE_NULL and len(_vehicle_folder(vehicle)) <= LONGEST_NAME
 
 
@@ -108,7 +108,7 @@ def _vehicle_folder(vehicle: str) -> str:
 
 
 def put(path: Path, content: Iterable[bytes]) -> None:
-    """A file that is there whole or not at all, in a folder that may have to be made; NotWritten."""
+    """Write a file whole or not at all, in a folder that may have to be made; NotWritten."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file_of_bytes(path) as out:
         out.writelines(content)
@@ -122,7 +122,7 @@ def replace_folder(new: Path, old: Path) -> None:
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> None:
-    """Rows as a Parquet file with units and versions; by default with the columns that occur. NotWritten."""
+    """Write rows as a Parquet file with units and versions; by default the columns that occur.  NotWritten."""
     import pyarrow.parquet as pq
 
     out = BytesIO()
@@ -131,7 +131,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[
 
 
 def log_rows(summaries: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of logs.parquet: the summaries; a reason of refusal that a log does not have was counted 0 times."""
+    """Return the rows of logs.parquet: the summaries, with 0 for each reason of refusal that a log lacks."""
     rows = [
         {name: value for name, value in summary.items() if name not in ("columns", "pieces")} for summary in summaries
     ]
@@ -140,7 +140,7 @@ def log_rows(summaries: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of vehicles.parquet.
+    """Return the rows of vehicles.parquet.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def _by_vehicle(*tables: Sequence[Mapping[str, Any]]) -> dict[str, tuple[list[Ma
 
 
 def write_map(path: Path, windows: Path) -> int:
-    """GeoParquet of all windows with a position.
+    """Write a GeoParquet file of all windows with a position.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ __all__ = ["Findings", "diagnose_logs"]
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """A diagnosis with what it was made from.
+    """Diagnosis with the recordings that it was made from.
 
     Attributes
     ----------
@@ -54,12 +54,12 @@ class Findings:
     plan: Plan | None = None
 
     def soils(self) -> list[tuple[str, Posterior, Posterior]]:
-        """Name, soil before and soil after of the first part of each log."""
+        """Return the name, soil before and soil after of the first part of each log."""
         names, found = [record.name for record in self.recordings.records], self.diagnosis
         return [(names[i], found.soil_before(i), found.soil_after(i)) for i in self.recordings.first]
 
     def largest_drafts(self) -> list[tuple[str, Estimate | None, Estimate | None]]:
-        """Name, and largest steady draft [N] on the level before and after, of the first part of each log.
+        """Return the name, and largest steady draft [N] before and after, of the first part of each log.
 
         Within the torque limits that the configuration names; None without a vehicle and where none is within limits.
         """
@@ -73,7 +73,7 @@ class Findings:
 
 
 def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Config) -> Estimate | None:
-    """Largest steady draft [N] on the level under a fitted model, on the soil of one of its recordings."""
+    """Return the largest steady draft [N] on the level under a fitted model, on one recording's soil."""
     problem, latents = fitted.checks[record].problem, fitted.checks[record].latents
     if problem.rig.chassis is None:
         return None

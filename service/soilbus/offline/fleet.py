@@ -29,14 +29,14 @@ LONGEST = 600.0
 
 
 def chosen(jobs: Sequence[Job]) -> list[Job]:
-    """At most MAX_LOGS of a vehicle's logs in the order of their dates: the first, the last, and evenly between."""
+    """Return at most MAX_LOGS of a vehicle's logs, spread evenly over their dates."""
     if len(jobs) <= MAX_LOGS:
         return list(jobs)
     return [jobs[i] for i in np.linspace(0, len(jobs) - 1, MAX_LOGS).round().astype(int)]
 
 
 def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
-    """What the logs of one vehicle show together; what cannot be diagnosed is said in `fault`.
+    """Diagnose the logs of one vehicle together; `fault` says what cannot be diagnosed.
 
     Parameters
     ----------
@@ -105,12 +105,12 @@ def _onset(onset: Onset, logs: Sequence[str]) -> dict[str, Any]:
 
 
 def no_findings(vehicle: str, fault: str) -> dict[str, Any]:
-    """Findings of a vehicle that cannot be diagnosed, and why."""
+    """Return the findings of a vehicle that cannot be diagnosed, and why."""
     return {"vehicle": vehicle, "logs": [], "left_out": [], "verdict": None, "fault": fault, "effects": []}
 
 
 def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The fleet's diagnosis.
+    """Return the fleet's diagnosis.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def effect_rows(fleet: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of effects.parquet: one for each parameter of each effect of a vehicle or a log."""
+    """Return the rows of effects.parquet: one for each parameter of each effect of a vehicle or a log."""
     rows = []
     for each in fleet["vehicles"]:
         for effect in each["effects"]:

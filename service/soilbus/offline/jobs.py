@@ -37,13 +37,13 @@ MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
 
 
 class BatchError(Exception):
-    """The batch cannot be done, or not to its end; the text is one line."""
+    """Error of a batch that cannot be done to its end; the text is one line."""
 
 
 def jobs_of(
     config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config], parts: Path | None = None
 ) -> list[Job]:
-    """The jobs that the arguments of the command stand for, in the order of vehicle and log.
+    """Return the jobs that the arguments of the command stand for, in the order of vehicle and log.
 
     Parameters
     ----------

@@ -27,11 +27,11 @@ HERE = "this machine"
 
 
 class KilledWorker(Exception):
-    """The process died each time that the task was tried."""
+    """Error of a task whose process died each time that it was tried."""
 
 
 class LocalWorkers:
-    """What `run_batch` uses of a Dask client, by processes of this machine.
+    """Processes of this machine with the methods of a Dask client that `run_batch` uses.
 
     Parameters
     ----------
@@ -46,13 +46,13 @@ class LocalWorkers:
         self._lanes = [_Lane(folder, memory) for _ in range(count)]
 
     def nthreads(self) -> dict[str, int]:
-        """The number of processes."""
+        """Return the number of processes."""
         return {HERE: len(self._lanes)}
 
     def run(
         self, function: Callable[..., Any], *arguments: Any, workers: Iterable[str] | None = None
     ) -> dict[str, Any]:
-        """What a function returns in each process; with `workers`, in this one, which has the same files."""
+        """Return what a function returns in each process; with `workers`, in this one."""
         if workers is not None:
             return dict.fromkeys(workers, function(*arguments))
         futures = [lane.submit(function, *arguments) for lane in self._lanes]
@@ -61,7 +61,7 @@ class LocalWorkers:
     def done_in_turn(
         self, function: Callable[..., Any], tasks: Iterable[tuple[str, tuple[Any, ...]]]
     ) -> Iterator[tuple[str, Any]]:
-        """Results as they come, by key; the exception itself where a task failed.
+        """Yield results as they come, by key; the exception itself where a task failed.
 
         Tasks are drawn one by one as others end.
         """
@@ -87,7 +87,7 @@ class LocalWorkers:
                 yield key, future.result() if fault is None else fault
 
     def close(self, *exception: Any) -> None:
-        """End the processes; of an exception (type, exception, traceback) without waiting for their tasks."""
+        """End the processes; after an exception without waiting for their tasks."""
         for lane in self._lanes:
             lane.close(*exception)
 
@@ -123,7 +123,7 @@ class _Lane:
 
 @contextmanager
 def local_workers(count: int | None = None) -> Iterator[LocalWorkers]:
-    """Processes of this machine, one for each core that this one may use by default."""
+    """Give processes of this machine, by default one for each core."""
     with tempfile.TemporaryDirectory(prefix="soilbus-", ignore_cleanup_errors=True) as folder, _one_thread():
         client = LocalWorkers(count or len(os.sched_getaffinity(0)), folder)
         with ExitStack() as stack:

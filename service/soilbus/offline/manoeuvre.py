@@ -62,7 +62,7 @@ def _brisk(low: float, high: float) -> Callable[[float], float]:
 
 
 class Pattern(NamedTuple):
-    """Words, values by time, and whether these swing within a step."""
+    """Course of one column: words, values by time, and whether these swing within a step."""
 
     words: str
     at: Callable[[float], float]
@@ -70,7 +70,7 @@ class Pattern(NamedTuple):
 
 
 def patterns(max_slip: float) -> dict[str, list[Pattern]]:
-    """Of each column the patterns that are tried, the first of them to begin with."""
+    """Return the patterns that are tried for each column, the first to begin with."""
     top = 0.75 * max_slip
     return {
         "slip": [
@@ -128,7 +128,7 @@ class Plan:
     repeats: int | None
 
     def as_json(self) -> dict[str, Any]:
-        """Keys of `manoeuvre` in the JSON of a diagnosis."""
+        """Return the keys of `manoeuvre` in the JSON of a diagnosis."""
         return {
             "between": list(self.between),
             "separations": {name: dict(row) for name, row in self.separations.items()},
@@ -139,7 +139,7 @@ class Plan:
 
 
 def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
-    """The manoeuvre that tells the rivals of an ambiguous diagnosis apart best; None where there are none.
+    """Return the manoeuvre that best tells the rivals of a diagnosis apart; None where there are none.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
 
 
 def what_excites(config: Config, soil: Soil) -> tuple[Manoeuvre, Posterior] | None:
-    """The manoeuvre that determines a soil best, and its expected posterior.
+    """Return the manoeuvre that determines a soil best, and its expected posterior.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def _beyond_motors(recording: Recording, config: Config) -> bool:
 
 
 def record_of_recording(name: str, recording: Recording, config: Config) -> Record:
-    """A simulated recording as the diagnosis takes it.
+    """Return a simulated recording in the form that the diagnosis takes.
 
     Raises
     ------

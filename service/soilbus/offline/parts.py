@@ -105,14 +105,14 @@ class Job:
 
     @property
     def digest(self) -> str:
-        """Names the part: of log, vehicle, start, configuration, and the versions of soilbus and schema."""
+        """Name of the part: digest of log, vehicle, start, configuration, and versions."""
         of = (self.log, self.vehicle, self.start, self.setup.digest, __version__, SCHEMA_VERSION)
         return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:24]
 
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """What a worker keeps of a part until it is asked for: its address, the file, the sizes of the pieces [bytes]."""
+    """Part that a worker keeps until it is asked for: its address, the file, sizes of the pieces [bytes]."""
 
     worker: str
     path: str
@@ -121,7 +121,7 @@ class Rest:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a log.
+    """Result of a log.
 
     Attributes
     ----------
@@ -152,17 +152,17 @@ class Outcome:
 
 
 class OtherVersion(Exception):
-    """A worker has another version of soilbus than the command."""
+    """Error of a worker with another version of soilbus than the command."""
 
 
 def check_version(version: str) -> None:
-    """Raises OtherVersion where the soilbus that asks is of another version than this one."""
+    """Raise OtherVersion where the soilbus that asks is of another version than this one."""
     if version != __version__:
         raise OtherVersion(f"a worker has soilbus {__version__}, this is {version}: install the same everywhere")
 
 
 def setup_of(config: Config, name: str) -> Setup:
-    """The setup of a configuration.
+    """Return the setup of a configuration.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def _with_dbcs_here(config: Config, folder: Path) -> Config:
 
 
 def place_of(log: str) -> str:
-    """Path or URL of a log without the archive that it lies in (`zip://T7/a.log::fleet.zip`) and a server's query."""
+    """Return path or URL of a log without the archive that it lies in and a server's query."""
     place, _, archive = log.partition("::")
     if "://" not in place:
         return log
@@ -209,7 +209,7 @@ def place_of(log: str) -> str:
 
 
 def file_name(log: str) -> str:
-    """Name of the file that a path or URL means."""
+    """Return the name of the file that a path or URL means."""
     return place_of(log).rpartition("/")[2]
 
 
@@ -236,7 +236,7 @@ def unpacked(content: bytes) -> tuple[Config, Database | None]:
 
 
 def part_of(job: Job, version: str, of_piece: int = WINDOWS_OF_PIECE) -> Outcome:
-    """Replay one log; its fault, if it has one, is in the outcome.
+    """Replay one log; a fault of the log is in the outcome.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def _check_is_file(path: Path) -> None:
 
 @contextmanager
 def local_log(job: Job) -> Iterator[Path]:
-    """Path of the log on this machine; of a URL, and of a log sent along, as long as the context lasts.
+    """Give the path of the log on this machine, for as long as the context lasts.
 
     Raises
     ------
@@ -368,7 +368,7 @@ def _worker() -> tuple[str, str]:
 
 
 def piece_left(path: str, begin: int, size: int) -> bytes:
-    """A piece of a part that was left on a worker; with the last one its file goes."""
+    """Return a piece of a part that was left on a worker; with the last one its file goes."""
     with open(path, "rb") as file:
         file.seek(begin)
         piece = file.read(size)
@@ -456,7 +456,7 @@ class _Summary:
 
 
 def summary_of_part(path: Path) -> dict[str, Any] | None:
-    """The summary in a part; None where there is no part."""
+    """Return the summary in a part; None where there is no part."""
     try:
         with opened(path) as part:
             summary: dict[str, Any] = json.loads(next(text_lines(part)))
@@ -474,7 +474,7 @@ def _shared(columns: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def pieces_of_part(path: Path, sizes: Sequence[int]) -> Iterator[bytes]:
-    """The windows of a part, as pieces of the sizes that its summary says."""
+    """Yield the windows of a part, as pieces of the sizes that its summary says."""
     with path.open("rb") as file:
         file.seek(-sum(sizes), SEEK_END)
         for size in sizes:
@@ -482,7 +482,7 @@ def pieces_of_part(path: Path, sizes: Sequence[int]) -> Iterator[bytes]:
 
 
 def rows_of_piece(piece: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
-    """The windows of a piece as rows of a table, `at_once` or fewer at a time."""
+    """Yield the windows of a piece as rows of a table, `at_once` or fewer at a time."""
     lines = text_lines(plain_bytes(BytesIO(piece)))
     while rows := [json.loads(line) for line in islice(lines, at_once)]:
         yield rows

@@ -36,16 +36,16 @@ class PlayedClock:
         self.now += max(seconds, 0.0)
 
     def wait_for(self, future: Future[Any], longest: float) -> None:
-        """Wait for what is never done while somebody waits."""
+        """Let the time `longest` [s] pass, unless the future is done."""
         if not future.done():
             self.sleep(longest)
 
 
 class InlineExecutor(Executor):
-    """Does the work at once, in the caller's thread and in no time of a PlayedClock."""
+    """Executor that does the work at once, in the caller's thread."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """The work, done."""
+        """Do the work and return it as done."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -55,7 +55,7 @@ class InlineExecutor(Executor):
 
 
 class PlayedBus:
-    """The frames of a recording that pass the filters, and what is sent meanwhile.
+    """Bus that carries the frames of a recording that pass the filters, and keeps what is sent.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class PlayedBus:
         return self._next is None
 
     def recv(self, timeout: float | None = None) -> Received | None:
-        """The next frame, or None after `timeout` [s]."""
+        """Return the next frame, or None after `timeout` [s]."""
         now, longest = self._clock.now, timeout or 0.0
         if self._next is None or (due := self._due(self._next.timestamp)) > now + longest:
             self._clock.sleep(max(longest, LEAST_WAIT))
@@ -102,12 +102,12 @@ class PlayedBus:
         self._sent.append(message)
 
     def take_sent(self) -> list[can.Message]:
-        """What was sent since the last call; not what went out before the first frame, which has no time."""
+        """Return what was sent since the last call, without what went out before the first frame."""
         sent, self._sent = self._sent, []
         return [message for message in sent if math.isfinite(message.timestamp)]
 
     def shutdown(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing, as there is nothing to close."""
 
     def _due(self, stamp: float) -> float:
         """When a frame comes, by the clock [s]."""

@@ -59,7 +59,7 @@ def recordings_of(
     longest: float = math.inf,
     partial: bool = False,
 ) -> Recordings:
-    """Read logs.
+    """Read logs as recordings of one vehicle.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def recordings_of(
 
 
 def check_different(logs: Sequence[Path]) -> None:
-    """Refuse a recording that is given twice, as one file or as a copy: its evidence would count twice.
+    """Refuse a recording that is given twice, as one file or as a copy.
 
     Files that differ in size are not read.
 
@@ -150,7 +150,7 @@ def parts(
     longest: float = math.inf,
     partial: bool = False,
 ) -> Iterator[Window]:
-    """The windows of a log, one for each stretch in which its clock was not set and it was not silent for long.
+    """Yield the windows of a log, one for each stretch without a set clock or a long silence.
 
     Raises
     ------

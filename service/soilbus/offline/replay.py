@@ -42,7 +42,7 @@ MAX_PENDING_WINDOWS = 30
 
 
 def read_log(path: Path, channel: str = "") -> Iterator[can.Message]:
-    """The frames of read_frames() as messages of python-can."""
+    """Yield the frames of read_frames() as messages of python-can."""
     for t, identifier, extended, data, remote, error in read_frames(path, channel):
         yield can.Message(
             timestamp=t, arbitration_id=identifier, is_extended_id=extended, data=data, is_remote_frame=remote,
@@ -51,7 +51,7 @@ def read_log(path: Path, channel: str = "") -> Iterator[can.Message]:
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:
-    """A name for each log: the shortest end of its path that no other log has, as `shown`.
+    """Return a name for each log: the shortest end of its path that no other log has, as `shown`.
 
     Logs whose names are alike all the same, as one that is given twice, have a number too.
     """
@@ -74,7 +74,7 @@ def replay(
     workers: Executor | None = None,
     on_fault: Callable[[LogError], None] | None = None,
 ) -> Iterator[WindowResult]:
-    """Results of every window of the logs.
+    """Yield the result of every window of the logs.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _plausible_time(admission: Admission, t: float) -> float:
 
 @contextmanager
 def estimator_beside(config: Config) -> Iterator[Executor | None]:
-    """A process that estimates while this one reads and decides; None on a machine with one core."""
+    """Give a process that estimates while this one reads and decides; None on a machine with one core."""
     if (os.cpu_count() or 1) < 2 or "fork" not in get_all_start_methods():
         yield None
         return
@@ -249,7 +249,7 @@ def _estimate(task: WindowTask) -> Undecided:
 
 
 def channel_notes(config: Config, logs: Iterable[Path]) -> list[str]:
-    """A line for each log whose first frames are not all of the configured channel; none for what cannot be read."""
+    """Return a line for each log whose first frames are not all of the configured channel."""
     notes = []
     for path in logs:
         if str(path) != "-" and config.columns is None:
@@ -261,7 +261,7 @@ def channel_notes(config: Config, logs: Iterable[Path]) -> list[str]:
 
 
 def log_of(config: Config, path: Path) -> Log | SignalTable:
-    """The log, of which the frames of the configured channel are read, or with [columns] the table of signals."""
+    """Return the log of the configured channel, or with [columns] the table of signals."""
     if config.columns is not None:
         return signal_table(config, path)
     return Log(path, config.log_channel or config.bus.channel, demanded=config.log_channel is not None)

@@ -31,7 +31,7 @@ __all__ = ["sent_beside", "sent_frames"]
 
 
 def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
-    """What the service sends while each log is on its bus; it begins again with each log.
+    """Yield what the service sends while each log is on its bus; it begins again with each log.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
 def sent_beside(
     config: Config, frames: Iterator[Frame], on_window: Callable[[WindowResult], None] | None = None
 ) -> Iterator[can.Message]:
-    """What the service sends while these frames are on its bus, as `sent_frames`; they may depend on what it sent.
+    """Yield what the service sends beside these frames, as `sent_frames`; they may depend on what it sent.
 
     `on_window` is called with each window's result.
     """

@@ -55,7 +55,7 @@ class Run:
 
 
 def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
-    """The runs of a CSV or Parquet file, in the order of their first rows.
+    """Return the runs of a CSV or Parquet file, in the order of their first rows.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
 
 
 def runs_of_columns(config: Config, columns: Columns, source: str) -> list[Run]:
-    """The runs of columns in memory; as runs_of(), with cells in place of a file's and None missing, too.
+    """Return the runs of columns in memory, as runs_of(); None is missing, too.
 
     Parameters
     ----------
@@ -123,13 +123,13 @@ def _runs(config: Config, columns: Columns, source: str, name: str) -> list[Run]
 
 
 def replay_tables(config: Config, paths: Sequence[Path]) -> Iterator[WindowResult]:
-    """Each run as one window of the daemon's own estimator; t is its last row's. TableError as runs_of()."""
+    """Yield each run as one window of the daemon's own estimator; t is its last row's.  TableError as runs_of()."""
     named = zip(paths, log_names(paths), strict=True)
     return replay_runs(config, (run for path, name in named for run in runs_of(config, path, name)))
 
 
 def replay_runs(config: Config, runs: Iterable[Run]) -> Iterator[WindowResult]:
-    """Each run as one window of the daemon's own estimator, `log` its name; runs without rows are left out."""
+    """Yield each run as one window of the daemon's own estimator, `log` its name; runs without rows are left out."""
     estimator = WindowEstimator(config)
     for index, run in enumerate(run for run in runs if len(run.window.t)):
         yield replace(estimator.solve(_task(index, run, estimator.rig)), log=run.name)
@@ -151,7 +151,7 @@ def _task(index: int, run: Run, rig: Rig) -> WindowTask:
 
 
 def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
-    """The runs of tables as the diagnosis wants them.
+    """Return the runs of tables in the form that the diagnosis takes.
 
     TableError as runs_of(), LogError for a table given twice, TooLittle for a table of short runs.
     """
@@ -178,7 +178,7 @@ def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
 
 
 def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
-    """The effects that a table can identify and the wheel can have, with priors for a wheel of this size and load.
+    """Return the effects that a table can identify and the wheel can have, with priors for its size and load.
 
     Effects of the true speed and of other wheels are left out; without a column of times those of time are too, because
     rows are often ordered by slip or load.
@@ -213,7 +213,7 @@ def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Ru
 
 
 def window_of_rows(rig: Rig, t: Array, values: Mapping[str, Array], rim_speed: float = 1.0) -> Window:
-    """A window of rows.
+    """Return a window of rows.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ __all__ = ["NO_CORRECTIONS", "Corrections"]
 
 @dataclass(frozen=True, slots=True)
 class Corrections:
-    """Of one window.
+    """Corrections of one window: torque limits and draft.
 
     Attributes
     ----------
@@ -36,12 +36,12 @@ class Corrections:
     effects: Sequence[Active] = ()
 
     def torque_limit(self, reported: Array) -> Array:
-        """Greatest available torque (W,) [N m] by the reported limits (W,); nan where not known."""
+        """Return the greatest available torque (W,) [N m] by the reported limits (W,); nan where not known."""
         limit = np.fmin(reported, self.torque_ceiling) if self.torque_ceiling else reported
         return np.where(np.isfinite(limit), limit, np.nan)
 
     def corrected(self, window: Window, rig: Rig) -> Window:
-        """The window with its draft corrected."""
+        """Return the window with its draft corrected."""
         if not any(active.effect.draft for active in self.effects) or not len(window.t):
             return window
         t = (window.t - window.t[0])[:, None]

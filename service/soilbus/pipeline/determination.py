@@ -56,7 +56,7 @@ class Excitation(NamedTuple):
 
 
 def excitation_of(window: Window, rig: Rig, min_speed: float) -> Excitation:
-    """Excitation of a forward window; slip only where the ground speed exceeds min_speed [m/s]."""
+    """Return the excitation of a forward window; slip only where the ground speed exceeds min_speed [m/s]."""
     ground = np.where(window.ground_speed > min_speed, window.ground_speed, np.nan)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = np.where(rig.drives, slip_ratio(rig.radius, window.speed, ground), np.nan)
@@ -77,7 +77,7 @@ def _spread(value: Array, variance: Array) -> tuple[float | None, float | None]:
 
 
 def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
-    """What varied too little in a window: load_range, slip_range or both, as far as its posterior says so.
+    """Return what varied too little in a window: load_range, slip_range or both.
 
     Of a vehicle its largest draft says whether slip varied enough, see `draft_is_known`.
     """
@@ -100,7 +100,7 @@ def draft_is_known(draft: Estimate | None, rig: Rig, settings: Estimator) -> boo
 
 
 def loaded_depths(fit: Fit, rig: Rig) -> tuple[float, float]:
-    """Least and greatest depth [m] at which the machine presses on the soil; 0 and infinity where not known."""
+    """Return the least and greatest depth [m] at which the machine presses on the soil; 0 and inf if not known."""
     depths = sinkage_range(fit, rig)
     if depths is None:
         return 0.0, np.inf
@@ -109,7 +109,7 @@ def loaded_depths(fit: Fit, rig: Rig) -> tuple[float, float]:
 
 
 def sinkage_range(fit: Fit, rig: Rig) -> tuple[float, float] | None:
-    """The 5 % and 95 % quantiles of the sinkage [m] over wheels and instants; None where not known."""
+    """Return the 5 % and 95 % quantiles of the sinkage [m] over wheels and instants; None where not known."""
     depth = sinkage(fit.optimum.latents.entry_angle, rig.radius)
     known = depth[np.isfinite(depth) & (fit.optimum.latents.entry_angle < MAX_ENTRY_ANGLE)]
     if not len(known):
@@ -120,7 +120,7 @@ def sinkage_range(fit: Fit, rig: Rig) -> tuple[float, float] | None:
 
 
 def contact_pressure(fit: Fit, rig: Rig) -> float:
-    """Median over wheels and instants of load over contact area [Pa]; a wheel's contact is r sin(entry angle) long."""
+    """Return the median of load over contact area [Pa] over wheels and instants."""
     latents = fit.optimum.latents
     length = rig.radius * np.sin(latents.entry_angle)
     if rig.lengths is not None:

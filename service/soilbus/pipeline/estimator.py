@@ -52,7 +52,7 @@ from soilbus.terra.effects.steady import CompletedModel
 
 @dataclass(frozen=True, slots=True)
 class Undecided:
-    """A window's estimate, and the inputs of its decision, which is still to be made.
+    """Estimate of a window with the inputs of its decision, which is still to be made.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Undecided:
 
 
 class WindowEstimator:
-    """Solves one window after the other: soil, status, decision, warning.
+    """Estimator of one window after the other: soil, status, decision, warning.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class WindowEstimator:
             hop=settings.hop,
         )  # fmt: skip
         if config.table is not None:
-            of_tracker = replace(of_tracker, min_rows=1, instant=0.0)  # a table's rows are chosen with care, and few
+            of_tracker = replace(of_tracker, min_rows=1, instant=0.0, stated_noise=True)  # rows are steady, and few
         self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
         self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
         self._driven_rig = self.rig
@@ -156,15 +156,15 @@ class WindowEstimator:
         return recompleted(window, self.rig, self._driven_rig)
 
     def solve(self, task: WindowTask) -> WindowResult:
-        """Result of one window, with decision and watch; windows in their order."""
+        """Return the result of one window, with decision and watch; windows in their order."""
         return self.decide(self.estimate(task))
 
     def solve_unwatched(self, task: WindowTask) -> WindowResult:
-        """Result of one window without a watch (it stays unknown), for callers that watch more often themselves."""
+        """Return the result of one window without a watch, for callers that watch more often themselves."""
         return self._decided(self.estimate(task))
 
     def estimate(self, task: WindowTask) -> Undecided:
-        """Soil and status of one window; windows in their order."""
+        """Return soil and status of one window; windows in their order."""
         if task.fresh:
             self._tracker.reset()
             self._engaged_at = -math.inf
@@ -225,7 +225,7 @@ class WindowEstimator:
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
     def decide(self, window: Undecided) -> WindowResult:
-        """The result with traversability and watch; windows in their order, here or in another process."""
+        """Return the result with traversability and watch; windows in their order, in any process."""
         result = self._decided(window)
         self._update_watch(window)
         if result.curve is not None:

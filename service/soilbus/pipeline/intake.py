@@ -129,7 +129,7 @@ class Refusals:
             self.total[str(reason)] += n
 
     def note_outliers(self, times: Array) -> None:
-        """Count samples as refused that were used until they were found to be outliers."""
+        """Count samples as refused that were counted as used before they were found to be outliers."""
         self.note(OUTLIER, times)
         self.used -= len(times)
 
@@ -140,7 +140,7 @@ class Refusals:
             self.total[reason] += len(times)
 
     def within(self, start: float, end: float) -> dict[str, int]:
-        """Counts by reason from start to end [s]; older ones are dropped."""
+        """Return the counts by reason from start to end [s]; older ones are dropped."""
         self.entries = [(r, t) for r, t in self.entries if t[-1] >= start]
         counts: Counter[str] = Counter()
         for reason, t in self.entries:
@@ -176,7 +176,7 @@ class ReportedLimits:
             self._reported[name] = np.concatenate([old_t, t]), np.concatenate([old, value])
 
     def at(self, t: float) -> Array:
-        """The limits (W,) in force at the time t [s]."""
+        """Return the limits (W,) in force at the time t [s]."""
         out = np.where(self._motors.driven, np.nan, 0.0)
         for motor in self._motors.motors:
             limit = self._of(motor, t)
@@ -196,7 +196,7 @@ class ReportedLimits:
             self._reported[wheel] = t[first:], value[first:]
 
     def forget_times(self) -> None:
-        """The clock was set: what was reported counts as earlier than all that follows."""
+        """Treat what was reported as earlier than all that follows, as the clock was set."""
         self._reported = {wheel: (np.full(len(t), -math.inf), value) for wheel, (t, value) in self._reported.items()}
 
 
@@ -256,7 +256,7 @@ class Intake:
         self.admission.at_break = self.begin_recording
 
     def of_another_recording(self) -> Intake:
-        """A new intake without any data, which continues the counts of windows, frames and refusals."""
+        """Return a new intake without data, which continues the counts of windows, frames and refusals."""
         other = Intake(self.config, self._database, self._delays, self._options)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
@@ -327,7 +327,7 @@ class Intake:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
     def due(self, now: float) -> list[WindowTask]:
-        """All windows that ended at or before `now` [s] and were not returned yet.
+        """Return all windows that ended at or before `now` [s] and were not returned yet.
 
         Hops without any sample end windows for LONGEST_GAP in all; each hop with samples earns one more.  So a log of
         short bursts far apart makes at most two windows a burst.
@@ -350,7 +350,7 @@ class Intake:
         return tasks
 
     def finish(self, now: float) -> list[WindowTask]:
-        """Windows still open at the end of a recording that lasts until `now` [s]."""
+        """Return the windows still open at the end of a recording that lasts until `now` [s]."""
         tasks = self.due(now)
         self.ingest(math.inf)
         tasks += self.due(now)
@@ -358,7 +358,7 @@ class Intake:
         return tasks
 
     def taken_whole(self) -> Window | None:
-        """All data since the clock was last set, as one window; later data are another recording.
+        """Return all data since the clock was last set as one window, and begin another recording.
 
         The bins are as short as the recording's spectrum asks for (see `sensors.rates`); the unfinished one is left
         out.  None without samples.
@@ -409,7 +409,7 @@ class Intake:
         return task
 
     def stale(self, now: float, since: float = -math.inf) -> list[str]:
-        """Names of needed channels without an accepted sample within their time-out before `now` [s].
+        """Return the names of needed channels without an accepted sample within their time-out before `now` [s].
 
         A channel without any sample yet is stale when its time-out has passed after `since` [s].
         """
@@ -420,11 +420,11 @@ class Intake:
         ]
 
     def untrusted(self, since: float) -> dict[str, str]:
-        """Channels, other than positions, with a sample refused for a second sender since `since` [s], and why."""
+        """Return channels with a sample refused for a second sender since `since` [s], and why; no positions."""
         return {name: str(Refusal.SECOND_SENDER) for name, t in self._last_untrusted.items() if t >= since}
 
     def refused(self, now: float) -> dict[str, str]:
-        """Needed channels with a refused sample within their time-out before `now` [s], and why it was refused."""
+        """Return the needed channels with a refused sample within their time-out before `now` [s], and why."""
         return {
             c.name: self._last_refused[c.name][1]
             for c in self.needed
@@ -432,7 +432,7 @@ class Intake:
         }
 
     def latest(self, now: float, corrections: Corrections = NO_CORRECTIONS) -> Latest:
-        """Slip, moment, draft and pitch over the last `moment_span` before `now` [s].
+        """Return the slip, moment, draft and pitch over the last `moment_span` before `now` [s].
 
         corrections: of the last window.  Pitch and acceleration may be as old as the time-out of a channel.
         """
@@ -472,7 +472,7 @@ def _times(decoded: Decoded) -> tuple[float, float] | None:
 
 
 def column_means(rows: Array) -> list[float | None]:
-    """Mean of each column of (N, W) over its finite entries; None for a column without any."""
+    """Return the mean of each column of (N, W) over its finite entries; None for a column without any."""
     known = np.isfinite(rows)
     count = known.sum(0)
     total = np.where(known, rows, 0.0).sum(0)
@@ -480,7 +480,7 @@ def column_means(rows: Array) -> list[float | None]:
 
 
 def coverage(window: Window, span: float) -> Array:
-    """Share of the window's blocks of `span` [s] in which each of the rig's channels has a sample, (channels,)."""
+    """Return the share of a window's blocks of `span` [s] with a sample, by channel of the rig."""
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
     known = np.isfinite(np.column_stack([getattr(window, q) for q in quantities]))
     if len(known) < 2:

@@ -34,7 +34,7 @@ SLIP_STEP = 1e-4
 
 
 def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
-    """Each quantity without noise at the times t [s] (N,): SI, (W, N) of the wheels, (N,) of the vehicle.
+    """Return each quantity without noise at the times t [s] (N,): SI, (W, N) of wheels, (N,) of the vehicle.
 
     Parameters
     ----------

@@ -102,12 +102,12 @@ def check_cycle_times(config: Config, database: Database) -> None:
 
 
 def json_line(result: WindowResult, config: Config) -> str:
-    """The result as one line of JSON (keys: docs/json.md), in SI units, null where not known."""
+    """Return the result as one line of JSON (keys: docs/json.md), in SI units, null where not known."""
     return json.dumps(window_record(result, config), allow_nan=False)
 
 
 def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
-    """The result as nested dicts and lists (keys: docs/json.md), in SI units, None where not known."""
+    """Return the result as nested dicts and lists (keys: docs/json.md), in SI units, None where not known."""
     decision = result.traversability
     bearing = {
         "z_ref": config.estimator.z_ref,
@@ -164,7 +164,7 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
 
 
 def flat_record(record: Mapping[str, Any]) -> dict[str, float | str | int | None]:
-    """A nested record as one row of a table.
+    """Return a nested record as one row of a table.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def column_names(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Columns of a table of flat records: those of all rows, parts of one quantity together.
+    """Return the columns of a table of flat records: those of all rows, parts of one quantity together.
 
     A part that is null as a whole in some rows (`soil` of an invalid window) is no column beside its own parts.
 
@@ -242,18 +242,18 @@ def _capability(capability: Capability) -> dict[str, Any]:
 
 
 def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
-    """The MAX_CLASSES most likely known soils and `unknown`, likeliest first."""
+    """Return the MAX_CLASSES most likely known soils and `unknown`, likeliest first."""
     known = [name for name in soil_class if name != UNKNOWN][:MAX_CLASSES]
     return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
 
 
 def value_std(estimate: Estimate | None) -> dict[str, float | None]:
-    """A value with its standard deviation, for JSON; None where not known."""
+    """Return a value with its standard deviation, for JSON; None where not known."""
     return {"value": None, "std": None} if estimate is None else {"value": estimate.value, "std": estimate.std}
 
 
 def values_std(estimates: Mapping[str, Estimate]) -> dict[str, dict[str, float | None]]:
-    """The same of several, by name."""
+    """Return values with their standard deviations, by name, for JSON."""
     return {name: value_std(estimate) for name, estimate in estimates.items()}
 
 
@@ -315,7 +315,7 @@ def _limits(capability: Capability | None) -> dict[str, float | None]:
 
 
 def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict[str, Any]]:
-    """(message, values in the DBC's units) of forecast and warning; result is None where none is valid any more."""
+    """Return (message, values) of forecast and warning; `result` is None where none is valid any more."""
     capability = None if result is None else result.traversability.capability
     forecast = None if capability is None else capability.forecast
     return "DemandForecast", {
@@ -330,12 +330,12 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
 
 
 def demand_frame(draft: float | None, pitch: float | None) -> tuple[str, dict[str, Any]]:
-    """(message, values in the DBC's units) of the present draft [N] and pitch [rad]; None where not known."""
+    """Return (message, values) of the present draft [N] and pitch [rad]; None where not known."""
     return "PresentDemand", {"Draft": draft, "Slope": pitch}
 
 
 def known(value: Any) -> Any:
-    """Nested dicts, lists and numbers for JSON: None instead of every number that is not finite."""
+    """Return nested dicts and lists for JSON, with None in place of numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: known(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

@@ -48,7 +48,7 @@ class Pipeline:
         self.intake, self.admission, self.feed = intake, intake.admission, intake.admission.feed
 
     def begin_recording(self) -> None:
-        """Begin another recording: nothing is carried over but the counts of windows, frames and refusals."""
+        """Begin another recording; only the counts of windows, frames and refusals are carried over."""
         self._use(self.intake.of_another_recording())
 
     @cached_property
@@ -57,7 +57,7 @@ class Pipeline:
         return self.new_estimator()
 
     def new_estimator(self) -> WindowEstimator:
-        """A new estimator without any state."""
+        """Return a new estimator without any state."""
         from soilbus.pipeline.estimator import WindowEstimator
 
         return WindowEstimator(self.config)
@@ -68,11 +68,11 @@ class Pipeline:
         return self.intake.next_end
 
     def advance(self, now: float) -> list[WindowResult]:
-        """Results of all windows that ended at or before `now` [s]."""
+        """Return the results of all windows that ended at or before `now` [s]."""
         return [self.estimator.solve(task) for task in self.intake.due(now)]
 
     def finish(self, now: float) -> list[WindowResult]:
-        """Results of the windows still open at the end of a recording that lasts until `now` [s]."""
+        """Return the results of the windows still open at the end of a recording that lasts until `now` [s]."""
         return [self.estimator.solve(task) for task in self.intake.finish(now)]
 
 

@@ -43,11 +43,11 @@ class PositionTrack:
         self.forget()
 
     def forget(self) -> None:
-        """Begin afresh."""
+        """Forget all fixes."""
         self._fixes: dict[str, tuple[Array, Array]] = dict.fromkeys(self._timeout, (np.zeros(0), np.zeros(0)))
 
     def copy(self) -> PositionTrack:
-        """A copy that later fixes do not change."""
+        """Return a copy that later fixes do not change."""
         track = PositionTrack(self._timeout, self._smoothing)
         track._fixes = dict(self._fixes)
         return track
@@ -61,7 +61,7 @@ class PositionTrack:
             self._fixes[name] = np.concatenate([old_t, t[fixed]]), np.concatenate([old_value, value[fixed]])
 
     def at(self, t: float) -> Position | None:
-        """The position at t [s]; None where the fixes before and after it are further apart than the timeout."""
+        """Return the position at t [s]; None where the fixes around it are further apart than the timeout."""
         if not self._timeout:
             return None
         latitude, longitude = (self._coordinate(name, t) for name in Position._fields)

@@ -28,7 +28,7 @@ FIRST_DATE, LAST_DATE = 946684800.0, 4102444800.0
 
 
 def is_date(t: float) -> bool:
-    """Whether a stamp [s] is a time of day, not seconds from some start."""
+    """Return whether a stamp [s] is a date, not seconds from some start."""
     return FIRST_DATE <= t < LAST_DATE
 
 
@@ -150,7 +150,7 @@ class WindowResult:
 
 
 def as_of(result: WindowResult, watch: Watch, now: float, config: Config) -> WindowResult:
-    """The result at a later time.
+    """Return the result as it stands at a later time.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ class ServiceState(StrEnum):
 
 
 def state_after(result: WindowResult) -> ServiceState:
-    """State of the service after a window's result, while its inputs keep coming."""
+    """Return the state of the service after a window's result, while its inputs keep coming."""
     match result.status:
         case Status.VALID:
             return ServiceState.VALID

@@ -18,7 +18,7 @@ DIAGNOSE = "record it and run soilbus diagnose"
 
 
 def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str | None:
-    """One line on windows of one status and reason.
+    """Return one line on windows of one status and reason.
 
     Parameters
     ----------
@@ -122,5 +122,5 @@ def _typical(of: Sequence[tuple[float | None, float | None]]) -> _Spread | None:
 
 
 def of_use(windows: Sequence[WindowResult]) -> list[WindowResult]:
-    """Those with an estimate of the soil, of any status."""
+    """Return the windows with an estimate of the soil, of any status."""
     return [window for window in windows if window.status is not Status.INVALID and window.posterior is not None]

@@ -17,7 +17,7 @@ MAX_FAULTS = 5
 
 
 def batch_text(batch: Batch, out: Path) -> str:
-    """The table and the lines below it."""
+    """Return the table of a batch and the lines below it."""
     head = ("vehicle", "logs", "failed", "damaged", "hours", "windows", "valid", "pressure, kPa", "refused samples")
     text = table(head, [_row(row) for row in batch.vehicles[:MAX_ROWS]])
     if len(batch.vehicles) > MAX_ROWS:
@@ -43,7 +43,7 @@ def batch_text(batch: Batch, out: Path) -> str:
 
 
 def fleet_text(fleet: Mapping[str, Any]) -> str:
-    """Which vehicles have which fault, since when; content of diagnosis.json in words."""
+    """Return which vehicles have which fault, and since when, in words."""
     lines = [
         f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
         f"at most {fleet['false_discovery_rate']:.0%} are expected to be false"

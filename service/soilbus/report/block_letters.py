@@ -24,7 +24,7 @@ HALVES = {"..": " ", "#.": "▀", ".#": "▄", "##": "█"}
 
 
 def pixels(word: str) -> list[str]:
-    """Rows of pixels (`#` and `.`) of a word in capitals, one empty column between letters.
+    """Return the rows of pixels (`#` and `.`) of a word in capitals, one empty column between letters.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def pixels(word: str) -> list[str]:
 
 
 def in_cells(word: str, width: int, height: int) -> list[str]:
-    """Lines of a word as large as fits into `width` columns and `height` rows; none where it does not fit.
+    """Return the lines of a word as large as fits into `width` columns and `height` rows; none where it does not fit.
 
     A pixel is at most two and a half times as wide as high in cells, that is hardly wider than high to the eye.
     """
@@ -50,7 +50,7 @@ def in_cells(word: str, width: int, height: int) -> list[str]:
 
 
 def in_half_cells(word: str, width: int) -> list[str]:
-    """Three lines of a word below half an empty one; none where it is wider than `width` columns."""
+    """Return three lines of a word below half an empty one; none where it is wider than `width` columns."""
     rows = pixels(word)
     if len(rows[0]) > width:
         return []

@@ -35,7 +35,7 @@ from soilbus.words import shown, text_of
 
 
 def configuration_report(config: Config) -> str:
-    """The whole report.
+    """Return the whole report of `soilbus check`.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def configuration_report(config: Config) -> str:
 
 
 def configuration_warnings(config: Config) -> list[str]:
-    """Lines on what is assumed, or cannot be estimated, because the configuration does not say it."""
+    """Return the lines on what is assumed, or cannot be estimated, because the configuration does not say it."""
     lines = []
     quantities = [q for q in _measured(config) if q not in config.noise.model_fields_set]
     if "noise" not in config.model_fields_set:
@@ -102,7 +102,7 @@ NO_SLOPE = (
 
 
 def shows_no_slope(config: Config) -> bool:
-    """Whether this is a vehicle of which no sensor shows the slope."""
+    """Return whether this is a vehicle without a sensor that shows the slope."""
     felt = config.signals.acceleration
     is_felt = config.signals.pitch is not None or (felt is not None and felt.kind == "specific_force")
     return config.vehicle is not None and config.table is None and not is_felt
@@ -160,7 +160,7 @@ def _measured(config: Config) -> Iterator[str]:
 
 
 def log_report(log: Log | SignalTable, found: Survey) -> str:
-    """What a log is, how long, of which channels, and which of the mapped messages it holds."""
+    """Return what a log is, how long, of which channels, and which of the mapped messages it holds."""
     mapped = dict.fromkeys(seen.channel.message for seen in found.seen)
     heard = {seen.channel.message for seen in found.seen if seen.count or seen.refused}
     missing = [name for name in mapped if name not in heard]
@@ -175,7 +175,7 @@ def log_report(log: Log | SignalTable, found: Survey) -> str:
 
 
 def survey_report(found: Survey) -> str:
-    """Received values of every mapped signal beside the configuration, and what the recording cannot show."""
+    """Return the received values of every mapped signal, and what the recording cannot show."""
     rows = [_heard_row(seen, found) for seen in found.seen]
     head = ("role", "values", "every", "from", "median", "to", "unit", "refused", "beside the configuration")
     return "\n" + table(head, rows) + text_of(f"not checkable from this log: {line}" for line in found.open)
@@ -210,7 +210,7 @@ def _report(config: Config, parts: list[str]) -> str:
 
 
 def defaults_text(config: Config) -> str:
-    """Every setting with its value in force, one dotted KEY = VALUE a line."""
+    """Return every setting with its value in force, one dotted KEY = VALUE a line."""
     lines: list[str] = []
 
     def walk(prefix: str, value: Any) -> None:
@@ -235,7 +235,7 @@ _LISTED = {"name", *WHEEL_ROLES, *AXLE_ROLES}
 
 
 def load_lines(config: Config) -> list[str]:
-    """What stands in place of load cells that are not there, and what that costs in a window of varied draft."""
+    """Return what replaces missing load cells, and what that costs in a window of varied draft."""
     rig = rig_of(config)
     given = rig.instrumentation
     if given is None or rig.chassis is None or not given.computes("load").any():
@@ -312,7 +312,7 @@ def _expected(config: Config) -> tuple[float, float] | None:
 
 
 def effect_lines(config: Config) -> list[str]:
-    """A line for each effect: which of its parameters are estimated and which held, or why it does not count."""
+    """Return a line for each effect: which of its parameters are estimated and which held, or why it does not count."""
     from soilbus.terra.effects.sensors import lateness  # not needed at a start without effects
 
     effects, free = effects_and_parameters_of(config)
@@ -358,7 +358,7 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
 
 
 def identifiable(config: Config) -> list[tuple[str, str]]:
-    """For each soil parameter which sensors determine it, or why none does.
+    """Return which sensors determine each soil parameter, or why none does.
 
     Returns
     -------

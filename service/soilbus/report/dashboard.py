@@ -85,7 +85,7 @@ CARRYING_SLIP = 0.6
 
 
 class Verdict(NamedTuple):
-    """State in a word for block letters, in a sentence that begins with it, what to do, and the kind of its colours."""
+    """Verdict in a word for block letters, in a sentence, what to do, and the kind of its colours."""
 
     word: str
     said: str
@@ -94,20 +94,20 @@ class Verdict(NamedTuple):
 
     @property
     def style(self) -> Style:
-        """Its colours, as reversed ones: a terminal without colour then shows it in reverse video."""
+        """Colours of the verdict, reversed: a terminal without colour then shows it in reverse video."""
         foreground, background = COLOURS[self.kind]
         return Style(color=background, bgcolor=foreground, reverse=True, bold=True)
 
     @property
     def block_style(self) -> Style:
-        """Of a full block: its colour also behind it, as fonts leave gaps between blocks."""
+        """Colours of a full block, also behind it, as fonts leave gaps between blocks."""
         foreground, _ = COLOURS[self.kind]
         return Style(color=foreground, bgcolor=foreground, reverse=True)
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What a configuration adds to the frames.
+    """Names and limits that a configuration adds to the frames.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class Vehicle:
 
     @classmethod
     def of(cls, config: Config, names_wheels: bool = True) -> Vehicle:
-        """Of a configuration; without names where the configuration is not that of the vehicle that is watched."""
+        """Return what a configuration adds; without names where it is not that of the watched vehicle."""
         wheels = config.wheel if names_wheels else []
         return cls(
             tuple(w.name for w in wheels),
@@ -140,7 +140,7 @@ class Vehicle:
         )  # fmt: skip
 
     def name(self, wheel: int) -> str:
-        """Name of a wheel, numbered from 0; its number from 1 where it has none."""
+        """Return the name of a wheel, numbered from 0; its number from 1 where it has none."""
         return self.wheels[wheel] if wheel < len(self.wheels) else str(wheel + 1)
 
 
@@ -155,7 +155,7 @@ class Slip(NamedTuple):
 
 @dataclass
 class Dashboard:
-    """Received frames and their last minute.
+    """Received frames and their last minute, as the dashboard shows them.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ class Dashboard:
             self._samples.popleft()
 
     def history(self, name: str, columns: int) -> list[float | None]:
-        """One value over the last `span` seconds, oldest first: the last sample in or before each column's time.
+        """Return a value over the last `span` seconds, oldest first, one for each column.
 
         None where it was not known for LONGEST_HOLD.
         """
@@ -216,7 +216,7 @@ class Dashboard:
         return held
 
     def verdict(self) -> Verdict:
-        """The state and what to do; stale frames are no state."""
+        """Return the verdict and what to do; without fresh frames there is no verdict."""
         known, silence = self.known, self.known.age("SoilbusStatus", "Traversability")
         if known.is_stale("SoilbusStatus") and known.is_stale("Traversability"):
             if silence is None:
@@ -305,7 +305,7 @@ class Dashboard:
             self._inputs_since = self.known.now - (uptime if uptime is not None and has_begun else 0.0)
 
     def until_first_window(self) -> str | None:
-        """How long until the first window has ended; None once there was one, or without inputs."""
+        """Return how long until the first window has ended; None once there was one, or without inputs."""
         if self._inputs_since is None or self.known.number("SoilbusStatus", "Window") is not None:
             return None
         left = math.ceil(self.vehicle.window - (self.known.now - self._inputs_since))
@@ -314,7 +314,7 @@ class Dashboard:
         return f"{'' if self._saw_them_begin else 'at most '}{left} s until the first window"
 
     def slip(self) -> Slip:
-        """Slip and set-points of the wheel that slips most; unknown axle: the smaller set-points of both."""
+        """Return the slip and set-points of the wheel that slips most; unknown axle: the smaller set-points of both."""
         known = [(value, i) for i in range(WHEELS) if (value := self.wheel_slip(i)) is not None]
         if not known:
             return Slip(None, "", *self._set_points(None))
@@ -335,25 +335,25 @@ class Dashboard:
         return best, most_pull
 
     def wheel_slip(self, wheel: int) -> float | None:
-        """Slip of a wheel, numbered from 0."""
+        """Return the slip of a wheel, numbered from 0."""
         return self.known.number("WheelSlip" if wheel < 4 else "WheelSlip2", f"SlipWheel{wheel + 1}")
 
     def wheel_sinkage(self, wheel: int) -> float | None:
-        """Sinkage [mm] of a wheel, numbered from 0."""
+        """Return the sinkage [mm] of a wheel, numbered from 0."""
         return self.known.number("WheelSinkage" if wheel < 4 else "WheelSinkage2", f"SinkageWheel{wheel + 1}")
 
     def wheels(self) -> list[int]:
-        """Numbers of the wheels to show: those of the configuration, else four and those that have a value."""
+        """Return the numbers of the wheels to show: those of the configuration, else four and those with a value."""
         named = len(self.vehicle.wheels) or 4
         has_value = (self.wheel_slip(i) is not None or self.wheel_sinkage(i) is not None for i in range(WHEELS))
         return [i for i, is_known in enumerate(has_value) if i < named or is_known]
 
     def max_draft(self) -> float | None:
-        """Largest draft [N] here and now, while it may be acted on."""
+        """Return the largest draft [N] here and now, while it may be acted on."""
         return self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
 
     def draft_of(self, draft: float, before: str = "of ", unknown: str = "") -> str:
-        """The draft [N] and the largest one in one unit; a negative draft brakes."""
+        """Return the draft [N] and the largest one in one unit; a negative draft brakes."""
         most = self.max_draft()
         unit = max(abs(draft), abs(most or 0.0))
         now = force(draft, unit)
@@ -361,7 +361,7 @@ class Dashboard:
         return now + (f" {before}{force(most, unit)}" if most is not None else f" {before}{unknown}" * bool(unknown))
 
     def freshness(self) -> str:
-        """Age of the data behind the state."""
+        """Return the age of the data behind the verdict."""
         age, since = (self.known.number("Traversability", name) for name in ("Age", "SinceValid"))
         if age is None:
             return "no data"
@@ -369,7 +369,7 @@ class Dashboard:
         return f"data {age:.1f} s old" + ("" if since is None else f", valid {more}{since:.1f} s ago")
 
     def sentences(self) -> list[str]:
-        """State, what to do, slip, draft, age, and why the bus is away; each where it is known."""
+        """Return the state, what to do, slip, draft, age, and why the bus is away; each where it is known."""
         verdict, slip, draft = self.verdict(), self.slip(), self.known.number("PresentDemand", "Draft")
         parts = [verdict.said, verdict.todo]
         if slip.value is not None:
@@ -383,16 +383,16 @@ class Dashboard:
 
 
 def percent(share: float) -> str:
-    """A share or a slip in per cent."""
+    """Return a share or a slip in per cent."""
     return f"{100.0 * share:.0f} %"
 
 
 def is_above(share: float, other: float) -> bool:
-    """Whether a share is greater than another by what a driver reads: whole per cents."""
+    """Return whether a share is greater than another in whole per cents, as a driver reads them."""
     return round(100.0 * share) > round(100.0 * other)
 
 
 def force(newtons: float, largest: float | None = None) -> str:
-    """A force in kN, in N where the largest one of its line (by default itself) is below 1 kN; no minus zero."""
+    """Return a force in kN, or in N where the largest one of its line is below 1 kN."""
     size, digits, unit = (1.0, 0, "N") if abs(newtons if largest is None else largest) < 1000.0 else (1000.0, 1, "kN")
     return f"{round(newtons / size, digits) + 0.0:.{digits}f} {unit}"

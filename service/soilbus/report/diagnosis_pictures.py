@@ -62,7 +62,7 @@ class Agreement(NamedTuple):
 
 
 def agreements(base: FittedModel, completed: FittedModel) -> list[Agreement]:
-    """The channels, the one first that shows best what the effects explain.
+    """Return the channels, the one first that shows best what the effects explain.
 
     Of each channel that regressor is taken over whose bins' mean differences have come nearest to zero, in chi-square;
     with nothing added, over whose bins they are largest.
@@ -95,7 +95,7 @@ def _bins(values: Array) -> list[Any]:
 
 
 def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Picture]]:
-    """Caption and picture of a channel before and, where anything was added, after; in the same scales."""
+    """Yield the caption and picture of a channel before and, where anything was added, after; in the same scales."""
     unit, name = QUANTITIES[of.channel], f"{of.channel} measured against modelled"
     shown = {"Before: ": of.before, "After: ": of.after} if added else {"": of.before}
     scales = _Scales.of(of)
@@ -167,13 +167,13 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales
 
 
 def channel_gaps(fitted: FittedModel) -> dict[str, float]:
-    """Mean square of the standardised residuals of each channel's held-out readings; 1 is noise."""
+    """Return the mean square of the standardised residuals of each channel's held-out readings; 1 is noise."""
     found = grouped(fitted.held_out_series(), lambda series: series.channel)
     return {c: float(np.mean(np.concatenate([part.standardised for part in of]) ** 2)) for c, of in found.items()}
 
 
 def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
-    """Root of the gap of each channel, before and after, as bars."""
+    """Return the root of the gap of each channel, before and after, as bars."""
     models = {"before": base} if base is completed else {"before": base, "after": completed}
     bars = {when: {c: gap**0.5 for c, gap in channel_gaps(model).items()} for when, model in models.items()}
     words = "; ".join(
@@ -224,7 +224,7 @@ def _draw_gaps(figure: Any, bars: Mapping[str, Mapping[str, float]]) -> None:
 
 
 def draft_picture(findings: Findings) -> Picture | None:
-    """Largest draft on each log's soil before and after, beside the drafts that were pulled; None without a vehicle."""
+    """Return the largest draft on each log's soil before and after, beside drafts pulled; None without a vehicle."""
     drafts = findings.largest_drafts()
     if all(before is None and after is None for _, before, after in drafts):
         return None
@@ -269,7 +269,7 @@ def _draw_drafts(
 
 
 def residual_picture(fitted: FittedModel, title: str) -> Picture:
-    """Standardised residuals by channel (rows) over slip, load and time (columns)."""
+    """Return the standardised residuals by channel (rows) over slip, load and time (columns)."""
     channels = grouped(fitted.held_out_series(), lambda series: series.channel)
     return picture(
         lambda figure: _draw_residuals(figure, channels, title),

@@ -21,7 +21,7 @@ AXIS = 11
 
 
 def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
-    """At most `height` lines of at most `width` columns."""
+    """Return the driver's page: at most `height` lines of at most `width` columns."""
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         return small_page(dashboard, width, height)
     verdict = dashboard.verdict()
@@ -36,7 +36,7 @@ def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
 
 
 def small_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
-    """State, what to do and the figures as wrapped text; what does not fit into `height` is left out."""
+    """Return verdict, what to do and figures as wrapped text of at most `height` lines."""
     verdict = dashboard.verdict()
     first, todo, *more = dashboard.sentences()
     lines = [Text(line.center(width), style=verdict.style) for line in textwrap.wrap(first, width)]
@@ -46,7 +46,7 @@ def small_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
 
 
 def band(verdict: Verdict, width: int, height: int) -> list[Text]:
-    """The state over the whole width: block letters, and under them the sentence."""
+    """Return the verdict over the whole width: block letters, and under them the sentence."""
     letters = in_cells(verdict.word, width - 2, height - 2) or [verdict.word]
     above = (height - 1 - len(letters)) // 2
     rows = ["", *[""] * (above - 1), *letters] if above else letters
@@ -60,7 +60,7 @@ def band(verdict: Verdict, width: int, height: int) -> list[Text]:
 
 
 def footer(dashboard: Dashboard, width: int) -> Text:
-    """Age of the data, or why there are none, and the keys."""
+    """Return the age of the data, or why there are none, and the keys."""
     said = f"bus away: {dashboard.fault}" if dashboard.fault else dashboard.freshness()
     said = textwrap.shorten(said, width - len(KEYS) - 2, placeholder="…")
     return Text(f"{said:<{width - len(KEYS)}}{KEYS}")

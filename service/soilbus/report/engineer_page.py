@@ -56,7 +56,7 @@ Row = tuple[Text | str, ...]
 
 
 def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
-    """At most `height` lines of at most `width` columns."""
+    """Return the engineer's page: at most `height` lines of at most `width` columns."""
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         return small_page(dashboard, width, height)
     head = [_head(dashboard, width), fitted(Text("  ".join(_forecast(dashboard.known))), width)]
@@ -73,13 +73,13 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
 
 
 def fitted(text: Text, width: int) -> Text:
-    """The text, with an ellipsis for what is beyond `width` columns."""
+    """Return the text, with an ellipsis for what is beyond `width` columns."""
     text.truncate(width, overflow="ellipsis")
     return text
 
 
 def packed(blocks: list[list[Text]], columns: int, width: int, space: int) -> list[Text]:
-    """Blocks one below the other in `columns` of equal width, each put where the column is shortest so far."""
+    """Return blocks packed into `columns` of equal width, each put into the shortest column so far."""
     each = (width - GAP * (columns - 1)) // columns
     stacks: list[list[Text]] = [[] for _ in range(columns)]
     for block in blocks:
@@ -96,7 +96,7 @@ def packed(blocks: list[list[Text]], columns: int, width: int, space: int) -> li
 
 
 def grid(title: Row, *rows: Row) -> list[Text]:
-    """Rows in columns as wide as their widest cell, with a bold title."""
+    """Return the rows in columns as wide as their widest cell, with a bold title."""
     cells = [[Text(cell, style="bold") if isinstance(cell, str) else cell for cell in title]]
     cells += [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
     widths = [max(cell.cell_len for cell in column) for column in zip(*cells, strict=True)]

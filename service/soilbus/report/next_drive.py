@@ -11,7 +11,7 @@ from soilbus.simulator.manoeuvre import Manoeuvre
 
 
 def plan_lines(plan: Plan) -> list[str]:
-    """What to drive next, and what it is expected to settle."""
+    """Return what to drive next, and what it is expected to settle."""
     return [
         f"what to drive next, to decide between {', '.join(plan.between)} ({plan.manoeuvre.duration:.0f} s; "
         "--manoeuvre-out keeps it):",
@@ -21,7 +21,7 @@ def plan_lines(plan: Plan) -> list[str]:
 
 
 def hope_of(plan: Plan) -> str:
-    """What a plan is expected to settle, and how often it must be driven."""
+    """Return what a plan is expected to settle, and how often it must be driven."""
     if plan.repeats is None:
         return f"even {MAX_REPEATS} such drives are not expected to settle it: rather take one of the sensors above"
     times = "once" if plan.repeats == 1 else f"{plan.repeats} times"
@@ -29,7 +29,7 @@ def hope_of(plan: Plan) -> str:
 
 
 def excitation_lines(manoeuvre: Manoeuvre, expected: Posterior, now: Posterior, config: Config) -> list[str]:
-    """A manoeuvre, and what it is expected to make of the standard deviations of a soil that is known so far."""
+    """Return a manoeuvre, and the standard deviations of the soil that are expected after it."""
     z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
     shares = []
     for posterior in (now, expected):

@@ -50,7 +50,7 @@ CITATION = (
 
 
 class Picture(NamedTuple):
-    """A picture: what it shows in words, for whoever cannot see it, and PNG in base64."""
+    """Picture as PNG in base64, with words for whoever cannot see it."""
 
     words: str
     png: str
@@ -66,7 +66,7 @@ class Table(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """What a report was made from.
+    """Recordings and configuration of a report.
 
     Attributes
     ----------
@@ -90,11 +90,11 @@ class Source:
 
     @property
     def names(self) -> list[str]:
-        """Of the recordings, as short as tells them apart."""
+        """Names of the recordings, as short as tells them apart."""
         return log_names(self.logs)
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Name and text of each line of a report's foot."""
+        """Yield the name and text of each line of a report's foot."""
         yield "soilbus", f"version {__version__}"
         yield "Recordings", ", ".join(self.names)
         yield "Configuration", self._configuration()
@@ -103,7 +103,7 @@ class Source:
         yield "How to cite", CITATION.format(version=__version__)
 
     def command(self, name: str, file: Path | str | None = None) -> str:
-        """A command over the same logs, to be typed: with another configuration, else with the same."""
+        """Return a command over the same logs, with another configuration or the same."""
         overrides = [] if file else [word for override in self.overrides for word in ("--set", override)]
         return shlex.join(
             ["soilbus", name, "--config", str(file or self.file or "FILE"), *overrides, *map(str, self.logs)]
@@ -141,7 +141,7 @@ def _wheel_text(wheel: Wheel) -> str:
 
 
 def page(template: str, source: Source, **content: Any) -> str:
-    """One page.
+    """Return one page of HTML.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def _printable(value: Any) -> Any:
 
 
 def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH, dpi: int = DPI) -> Picture:
-    """A picture for a page.
+    """Return a picture for a page.
 
     Parameters
     ----------

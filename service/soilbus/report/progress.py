@@ -11,7 +11,7 @@ from soilbus.words import shown
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
-    """Yields a function to call with frames read and time since the recording's begin [s]; None in a pipe."""
+    """Give a function to call with frames read and time [s] since the begin; None in a pipe."""
     with phases(title) as say:
         if say is None:
             yield None
@@ -21,7 +21,7 @@ def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
 
 @contextmanager
 def phases(title: str) -> Iterator[Callable[[str], None] | None]:
-    """Yields a function to call with what is being done; None in a pipe."""
+    """Give a function to call with what is being done; None in a pipe."""
     if not sys.stderr.isatty():
         yield None
         return

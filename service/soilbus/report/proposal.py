@@ -54,7 +54,7 @@ MOST_LISTED = 4
 
 
 class Proposal(NamedTuple):
-    """The text of a configuration; how many signals it maps and how many values it leaves open."""
+    """Text of a proposed configuration, with the numbers of mapped signals and open values."""
 
     text: str
     mapped: int
@@ -157,7 +157,7 @@ def _open_values(value: Any) -> int:
 def proposal(
     database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str, time: str = ""
 ) -> Proposal:
-    """A configuration of four wheels, or of those of more axles, from what was matched.
+    """Return a configuration proposed from matched signals.
 
     Parameters
     ----------

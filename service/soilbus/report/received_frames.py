@@ -115,16 +115,16 @@ class ReceivedFrames:
         return self._clock() < max(stream.distrusted_until for stream in self._streams.values())
 
     def age(self, *messages: str) -> float | None:
-        """Time [s] since the last good frame of any of these messages, or of any at all; None where there was none."""
+        """Return the time [s] since the last good frame of these messages, or of any; None without one."""
         seen = max(self._streams[name].seen for name in messages or self._streams)
         return self._clock() - seen if math.isfinite(seen) else None
 
     def is_stale(self, message: str) -> bool:
-        """Whether no good frame came for CYCLES_UNTIL_STALE cycles, or none at all."""
+        """Return whether no good frame came for CYCLES_UNTIL_STALE cycles, or none at all."""
         return self._streams[message].is_stale(self._clock())
 
     def receive(self, message: Received | can.Message) -> None:
-        """Take one frame; a bad one (wrong checksum, repeated counter, not decodable) is counted and not used."""
+        """Take one frame; count and drop a bad one (checksum, repeated counter, not decodable)."""
         layout = self._messages.get((message.arbitration_id, message.is_extended_id))
         if layout is None or message.is_remote_frame or len(message.data) != layout.length:
             return
@@ -142,7 +142,7 @@ class ReceivedFrames:
             self.bad_frames += 1
 
     def value(self, message: str, signal: str) -> float | str | None:
-        """A signal's value, or its name in the value table; the state of Traversability is the verdict to show.
+        """Return a signal's value, or its name in the value table.
 
         Returns
         -------
@@ -165,23 +165,23 @@ class ReceivedFrames:
 
     @property
     def is_unproven(self) -> bool:
-        """Whether the last verdict received says more than may be shown, for want of frames in a row."""
+        """Whether the last verdict may not be shown yet, for want of frames in a row."""
         stream = self._streams["Traversability"]
         return bool(stream.values) and str(stream.values["State"]) in STATES[2:] and stream.verdict() == STATES[0]
 
     def number(self, message: str, signal: str) -> float | None:
-        """A signal's value where it is a number."""
+        """Return a signal's value where it is a number."""
         value = self.value(message, signal)
         return value if isinstance(value, float) else None
 
     def is_at_top(self, message: str, signal: str) -> bool:
-        """Whether a number is the greatest that its signal can say, which of one that saturates means this or more."""
+        """Return whether a number is the greatest that its signal can say."""
         value = self.number(message, signal)
         top = None if value is None else self._signals[message][signal].maximum
         return value is not None and top is not None and value >= top
 
     def is_valid(self, message: str) -> bool:
-        """Whether a message may be acted on: fresh, of one sender, and its Status, where it has one, is valid."""
+        """Return whether a message may be acted on: fresh, of one sender, its Status (if any) valid."""
         status = self.value(message, "Status")
         has_status = "Status" in self._signals[message]
         return not self.has_second_sender and (status == "valid" if has_status else not self.is_stale(message))

@@ -24,7 +24,7 @@ COUNTS = {
 
 
 def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
-    """What the received frames say, as nested dicts (keys: docs/json.md).
+    """Return what the received frames say as nested dicts (keys: docs/json.md).
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
 
 
 def gist(record: dict[str, Any]) -> tuple[Any, ...]:
-    """The window and the states of a record; where they change there is something to say."""
+    """Return the window and the states of a record, whose change is worth a line."""
     of_window = (record[key] for key in ("window", "status", "state", "reason", "fault", "second_sender"))
     return (*of_window, record["traversability"]["state"], record["warning"]["state"])
 

@@ -28,7 +28,7 @@ from soilbus.report.windows import by_reason, machine_line, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
-    """The whole page.
+    """Return the whole page of a replay.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def _pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple
 
 
 def headline(results: Sequence[WindowResult], config: Config) -> str:
-    """What the decisions come to, in one sentence."""
+    """Return what the decisions come to, in one sentence."""
     known = of_use(results)
     if not known:
         text = why_of_no_use(results, config.estimator.window)
@@ -88,7 +88,7 @@ def headline(results: Sequence[WindowResult], config: Config) -> str:
 
 
 def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
-    """Soil and draft in numbers, in words of the field."""
+    """Yield the soil and draft in numbers, in words of the field."""
     good = [r for r in results if r.status is Status.VALID]
     used, doubtful = (good, "") if good else (of_use(results), ", but no window is valid: doubtful")
     pressures = [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in used if r.bearing is not None]
@@ -118,7 +118,7 @@ def _range(values: Sequence[float] | Array, unit: str) -> str:
 
 
 def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tuple[str, str]]:
-    """What to do about windows of no or little use, and what to map: a sentence, and a command or nothing."""
+    """Yield what to do about windows of no or little use, and what to map: a sentence, and a command or nothing."""
     config = source.config
     good = [r for r in results if r.status is Status.VALID]
     for (status, reason), group in by_reason(results):

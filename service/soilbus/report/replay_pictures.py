@@ -40,7 +40,7 @@ BAND_SD = 2.0
 
 
 class Look(NamedTuple):
-    """Name, colour, hatch and marker of a state: which differ in grey, too."""
+    """Name, colour, hatch and marker of a state, which differ in grey, too."""
 
     name: str
     colour: str
@@ -63,7 +63,7 @@ STATUSES = {
 
 
 def stretches(results: Sequence[WindowResult]) -> list[list[WindowResult]]:
-    """The windows cut where another log, or another time of its clock, begins."""
+    """Return the windows cut where another log, or another time of its clock, begins."""
     cut: list[list[WindowResult]] = []
     for r in results:
         if not cut or r.log != cut[-1][-1].log or not 0.0 < r.t - cut[-1][-1].t <= LONGEST_GAP:
@@ -73,19 +73,19 @@ def stretches(results: Sequence[WindowResult]) -> list[list[WindowResult]]:
 
 
 def clock_text(t: float, form: str = "%H:%M:%S") -> str:
-    """A stamp [s] as a time of day (UTC), or in seconds where it is none."""
+    """Return a stamp [s] as a time of day (UTC), or in seconds where it is none."""
     return f"{datetime.fromtimestamp(t, UTC):{form}}" if is_date(t) else f"{t:g} s"
 
 
 def dates(results: Sequence[WindowResult]) -> str:
-    """The days of the windows, as in "2026-05-04 to 2026-05-05"; empty where their stamps are no times of day."""
+    """Return the days of the windows, as in "2026-05-04 to 2026-05-05"; empty where stamps are no dates."""
     known = sorted(r.t for r in results if is_date(r.t))
     days = dict.fromkeys(clock_text(t, "%Y-%m-%d") for t in (known[0], known[-1])) if known else {}
     return " to ".join(days)
 
 
 class TimeAxis:
-    """Recordings one after the other.
+    """Time axis with recordings one after the other.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class TimeAxis:
         self.end = float(begins[-1] - space)
 
     def curve(self, of: Callable[[WindowResult], Any], columns: int = 1) -> Array:
-        """Columns time and values (N, 1 + columns) of all windows; nan breaks the line where a value is None."""
+        """Return the columns time and values (N, 1 + columns) of all windows; nan breaks the line at None."""
         rows: list[list[float]] = []
         for part, shift in zip(self.parts, self.shift, strict=True):
             last = -math.inf
@@ -120,7 +120,7 @@ class TimeAxis:
         return np.array(rows)
 
     def segments(self, of: Callable[[WindowResult], Any]) -> Iterator[tuple[Any, float, float]]:
-        """Value, begin and length of each run of windows with the same value."""
+        """Yield the value, begin and length of each run of windows with the same value."""
         for part, shift in zip(self.parts, self.shift, strict=True):
             for value, group in groupby(part, of):
                 members = list(group)
@@ -128,7 +128,7 @@ class TimeAxis:
                 yield value, begin, members[-1].t + shift - begin
 
     def dress(self, axis: Any) -> None:
-        """Ticks with clock times, and a rule between recordings."""
+        """Draw ticks with clock times, and a rule between recordings."""
         step = next((s for s in TICK_STEPS if self.length / s <= MAX_TICKS), TICK_STEPS[-1])
         day = dates(self._results)
         places, labels = self._ticks(step)
@@ -170,7 +170,7 @@ class TimeAxis:
 
 
 def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture:
-    """The decision as a ribbon, the estimate's quality below, and the draft pulled beside the largest possible."""
+    """Return the decision as a ribbon, the estimate's quality below, and the draft beside the largest possible."""
     time = TimeAxis(results, config.estimator.hop)
 
     def draw(figure: Any) -> None:
@@ -206,7 +206,7 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
 
 
 def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
-    """Caption and picture of each quantity over time that is known anywhere, the bearing pressure first."""
+    """Yield the caption and picture of each quantity over time that is known anywhere, the bearing pressure first."""
     time = TimeAxis(results, config.estimator.hop)
     plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
     wheels = list(results[0].slip)
@@ -238,7 +238,7 @@ def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[
 
 
 def run_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
-    """Caption and picture of the soil in each run of a test rig."""
+    """Yield the caption and picture of the soil in each run of a test rig."""
 
     def drawn(label: str, of: Callable[[WindowResult], Estimate | None], unit: float) -> Picture:
         return picture(lambda figure: _draw_runs(figure, results, of, unit, label), 3.2, f"{label} of each run")
@@ -262,7 +262,7 @@ def _draw_runs(
 
 
 def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
-    """Caption and picture of the route, by decision and by largest draft; none without positions."""
+    """Yield the caption and picture of the route, by decision and by largest draft; none without positions."""
     placed = [r for r in results if r.position is not None]
     if len(placed) < 2:
         return

@@ -26,7 +26,7 @@ MAX_SOILS_NAMED = 3
 
 
 def prior_text(config: Config) -> str:
-    """The 95 % interval of each parameter before any data, and the known soils that lie outside of it."""
+    """Return the 95 % interval of each parameter before any data, and the known soils that lie outside of it."""
     head = ("parameter", "assumed", "95 % from", "to", "unit", "known soils outside")
     return (
         table(head, list(_rows(config)))

@@ -11,7 +11,7 @@ AT_EDGE = "at the edge of its range"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Left-aligned columns under a ruled head, one line a row."""
+    """Return the left-aligned columns under a ruled head, one line a row."""
     lines = [tuple(shown(cell, LONGEST_NAME) for cell in line) for line in (head, *rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
     text = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
@@ -20,5 +20,5 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def value_text(value: float, std: float, held: str = "held", sign: str = "+-") -> str:
-    """A value with its standard deviation, or why it has none."""
+    """Return a value with its standard deviation, or why it has none."""
     return f"{value:.4g} {sign} {std:.2g}" if std > 0.0 else f"{value:.4g} ({held})"

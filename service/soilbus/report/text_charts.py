@@ -17,7 +17,7 @@ Series = Sequence[float | None]
 
 
 def bar(value: float | None, top: float, width: int) -> str:
-    """A bar of `width` cells that is full at `top`; empty below zero and where the value is not known."""
+    """Return a bar of `width` cells that is full at `top`; empty below zero and where the value is not known."""
     if value is None or top <= 0.0:
         return " " * width
     eighths = round(8 * width * min(max(value / top, 0.0), 1.0))
@@ -25,12 +25,12 @@ def bar(value: float | None, top: float, width: int) -> str:
 
 
 def place(value: float, top: float, width: int) -> int:
-    """Index of the cell of a bar at which a value lies."""
+    """Return the index of the cell of a bar at which a value lies."""
     return min(max(int(width * value / top), 0), width - 1)
 
 
 def sparkline(values: Series) -> str:
-    """One line, from the smallest to the largest value; a value that hardly changes is drawn in the middle."""
+    """Return one line, from the smallest to the largest value; a value that hardly changes is drawn in the middle."""
     known = [value for value in values if value is not None]
     low, high = min(known, default=0.0), max(known, default=0.0)
     if high - low <= 0.02 * max(abs(high), abs(low)):
@@ -39,7 +39,7 @@ def sparkline(values: Series) -> str:
 
 
 def area(values: Series, height: int, top: float, limits: Series = ()) -> list[str]:
-    """Lines of a chart from 0 to `top`: the values filled from below, the limits as a line above them.
+    """Return the lines of a chart from 0 to `top`: values filled from below, limits as a line.
 
     Parameters
     ----------

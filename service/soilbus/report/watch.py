@@ -49,13 +49,13 @@ PAGES = {"driver": driver_page, "engineer": engineer_page}
 
 
 class Source(Protocol):
-    """Where frames come from."""
+    """Source of frames: a bus or a recording."""
 
     fault: str
     """Why there are none; empty where it works."""
 
     def receive(self, timeout: float, /) -> Received | can.Message | None:
-        """The next frame, or None after at most `timeout` [s]."""
+        """Return the next frame, or None after at most `timeout` [s]."""
 
 
 class PlayedLog:
@@ -92,11 +92,11 @@ class PlayedLog:
         return self._next is None
 
     def now(self) -> float:
-        """Time [s] of the recording, without the jumps of its clock."""
+        """Return the time [s] of the recording, without the jumps of its clock."""
         return self._first + self._speed * (self._clock() - self._began)
 
     def receive(self, timeout: float, /) -> can.Message | None:
-        """The next frame, or None after at most `timeout` [s]."""
+        """Return the next frame, or None after at most `timeout` [s]."""
         message = self._next
         if message is None:
             return None
@@ -113,7 +113,7 @@ class PlayedLog:
 
 
 class Pace:
-    """Time [s] of a recording that is played: it goes on by `sleep` alone, so that no pause of ours is a silence.
+    """Clock of a recording that is played: only `sleep` moves it on.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class Pace:
         return self._now
 
     def sleep(self, seconds: float) -> None:
-        """Let this time of the recording pass, and as much of ours as belongs to it."""
+        """Let this time of the recording pass, and as much real time as belongs to it."""
         self._now += seconds
         time.sleep(max(0.0, self._began + self._now / self._speed - time.monotonic()))
 
@@ -179,7 +179,7 @@ def watch_log(
     plain: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Show the dashboard of a recording of our frames in its own time; the end of the recording ends it.
+    """Show the dashboard of a recording of our frames in its own time, to its end.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def _show_as(
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
-    """A page's picture."""
+    """Return a page as a picture for the terminal."""
     lines = PAGES[name](dashboard, width, height)
     for line in lines:
         line.no_wrap, line.overflow = True, "crop"
@@ -237,7 +237,7 @@ def show(
     clock: Callable[[], float] = time.monotonic,
     stays: bool = False,
 ) -> None:
-    """Feed frames and show them until `done`, or until a key says so.
+    """Feed frames and show them until `done`, or until a key ends it.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def print_results(
     out: IO[str],
     done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Print a line of JSON for each window that is received, and for each change of state between two, until `done`.
+    """Print a line of JSON for each received window, and for each change of state in between.
 
     A window's line waits for the verdict that rests on it, at most a cycle of the fast frames.
 
@@ -340,13 +340,13 @@ def _take(dashboard: Dashboard, source: Source, timeout: float) -> Received | ca
 
 
 def no_key() -> str:
-    """No key, as none can be pressed."""
+    """Return no key, where none can be pressed."""
     return ""
 
 
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
-    """A function that gives the next key pressed, or "" at once; always "" where standard input is no terminal of ours.
+    """Give a function that returns the next key pressed, or "" at once.
 
     Keys come one by one and are not echoed until the end; Ctrl-C stays what it is.
     """

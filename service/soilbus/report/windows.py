@@ -22,7 +22,7 @@ from soilbus.words import text_of
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
-    """Summary of a replay of logs.
+    """Return the summary of a replay of logs.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def summary_of(
     no_slope: bool = False,
     doubted: Sequence[str] = (),
 ) -> str:
-    """Summary of windows from any source.
+    """Return the summary of windows from any source.
 
     Parameters
     ----------
@@ -112,12 +112,12 @@ def machine_line(results: Sequence[WindowResult]) -> str | None:
 
 
 def unused(results: Sequence[WindowResult]) -> int:
-    """Number of windows without an estimate of the soil."""
+    """Return the number of windows without an estimate of the soil."""
     return len(results) - len(of_use(results))
 
 
 def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
-    """One line on windows of which none has an estimate.
+    """Return one line on why no window has an estimate.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
 
 
 def by_reason(results: Sequence[WindowResult]) -> list[tuple[tuple[str, str], list[WindowResult]]]:
-    """The windows by status and reason, the most frequent first."""
+    """Return the windows by status and reason, the most frequent first."""
     groups = grouped(results, lambda r: (str(r.status), r.reason))
     return sorted(groups.items(), key=lambda item: -len(item[1]))
 
@@ -152,5 +152,5 @@ def _by_log(results: Sequence[WindowResult]) -> list[str]:
 
 
 def counted(counts: Counter[str]) -> str:
-    """As in "outlier 3, stale 1", the most frequent first; "none" without any."""
+    """Return counts as in "outlier 3, stale 1", the most frequent first; "none" without any."""
     return ", ".join(f"{name} {n}" for name, n in counts.most_common()) or "none"

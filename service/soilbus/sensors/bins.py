@@ -60,7 +60,7 @@ class Bins:
         self._recent.append(Samples(column, since, value, np.zeros(len(value), bool)))
 
     def window(self, start: float, end: float) -> Window:
-        """The bins from start to end [s], both rounded to whole bins."""
+        """Return the bins from start to end [s], both rounded to whole bins."""
         low, high = self._span(start, end)
         samples, outlier, later = outlier_test(self._taken(high), self._noise.sd, self.options)
         new = ~samples.settled
@@ -73,7 +73,7 @@ class Bins:
         return self._made(self._totals, low, high)
 
     def glimpse(self, start: float, end: float) -> Window:
-        """As `window`, but without changing the state: later windows are the same as without it."""
+        """Return the same as `window` without changing the state."""
         low, high = self._span(start, end)
         recent = list(self._recent)
         samples = self._taken(high)
@@ -83,7 +83,7 @@ class Bins:
         return self._made(totals, low, high)
 
     def screened(self, end: float) -> Samples:
-        """The samples before `end` [s] without outliers, times [s] from `origin`; the state does not change."""
+        """Return the samples before `end` [s] without outliers, times [s] from `origin`; keep the state."""
         recent = list(self._recent)
         high = round((end - self.origin) / self.bin_length)
         samples, outlier, _ = outlier_test(self._taken(high), self._noise.sd, self.options)
@@ -91,7 +91,7 @@ class Bins:
         return samples.pick(~outlier)
 
     def new_outliers(self) -> Array:
-        """Times [s], ascending, of the samples finally found to be outliers since the last call."""
+        """Return the times [s], ascending, of the samples finally found to be outliers since the last call."""
         found = np.sort(np.concatenate([np.zeros(0), *self._outliers]))
         self._outliers.clear()
         return found
@@ -151,7 +151,7 @@ class Bins:
 
 
 def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Array:
-    """Mean value (n,) of samples (N,) at times t [s] in each of n bins of a length [s]; nan in a bin without any."""
+    """Return the mean (n,) of samples (N,) at times t [s] in each of n bins of a length [s]; nan in an empty bin."""
     place = np.floor((t - start) / length + 1e-6).astype(np.intp)
     inside = (place >= 0) & (place < n)
     with np.errstate(invalid="ignore", divide="ignore"):

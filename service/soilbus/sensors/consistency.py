@@ -52,7 +52,7 @@ class Resolution(NamedTuple):
 
 
 class ConsistencyInput(NamedTuple):
-    """One window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
+    """Window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
 
     window has values of every wheel (`instrumentation.completed`), raw the channels alone.
 
@@ -90,7 +90,7 @@ class Checked(NamedTuple):
 
 
 class SensorConsistency:
-    """Judges windows; the speeds of the motors, which no estimate needs, are kept here."""
+    """Checks whether sensors contradict each other; it keeps the speeds of the motors for that."""
 
     def __init__(self, rig: Rig, channels: Iterable[Channel], database: Database, settings: Estimator) -> None:
         self._rig, self._settings = rig, settings
@@ -100,17 +100,17 @@ class SensorConsistency:
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was heard."""
+        """Forget the speeds of the motors."""
         self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in self._motors}
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
-        """Samples (t [s], value in SI; both (N,)) by channel; only the motors' speeds are kept."""
+        """Keep the motors' speeds among these samples (t [s], value in SI; both (N,)) by channel."""
         for wheel, heard in self._heard.items():
             if found := samples.get(f"{MOTOR_SPEED}.{wheel}"):
                 heard.append(found)
 
     def checked(self, window: Window) -> Checked:
-        """A forward window (`window.forward`) without the channels that contradict the others."""
+        """Return a forward window without the channels that contradict the others."""
         s = self._settings
         names = implausible(
             window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, self._motor_speed(window)
@@ -118,7 +118,7 @@ class SensorConsistency:
         return Checked(without(window, self._rig, set(names)), names)
 
     def drop_before(self, t: float) -> None:
-        """Forget what was heard before t [s]."""
+        """Forget the speeds of the motors before t [s]."""
         for wheel, heard in self._heard.items():
             self._heard[wheel] = [part for part in heard if part[0][-1] >= t]
 
@@ -138,7 +138,7 @@ class SensorConsistency:
 
 
 def resolution_of(channel: Channel, database: Database) -> Resolution:
-    """The step of a channel's signal in SI, and whether zero is the end of its range."""
+    """Return the step of a channel's signal in SI, and whether zero is the end of its range."""
     signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
     step = 0.0 if signal.conversion.is_float else abs(channel.factor * float(signal.scale))
     ends = (signal.minimum, signal.maximum)
@@ -156,7 +156,7 @@ def implausible(
     motor_speed: Array | None = None,
     options: ConsistencyOptions = CONSISTENCY,
 ) -> tuple[str, ...]:
-    """Channels of a forward window (see `window.forward`) that contradict the others, in the order of rig.channels.
+    """Return the channels of a forward window that contradict the others, in the order of rig.channels.
 
     min_speed [m/s] and max_turn as the estimator's gates; resolution by channel name;
     motor_speed [rad/s] (N, W), nan where unknown, may be named as "motor_speed.FL".
@@ -187,7 +187,7 @@ def implausible(
 
 
 def without(window: Window, rig: Rig, channels: set[str]) -> Window:
-    """The window without any reading of these channels."""
+    """Return the window without any reading of these channels."""
     values: dict[str, Array] = {}
     for i, name in enumerate(rig.channels):
         if name in channels:
@@ -199,7 +199,7 @@ def without(window: Window, rig: Rig, channels: set[str]) -> Window:
 
 
 def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
-    """The channels that values of wheels rest on; none for a value that is computed."""
+    """Yield the channels that values of wheels rest on; none for a value that is computed."""
     for name in names:
         quantity, _, wheel = name.partition(".")
         if rig.instrumentation is None or quantity not in ("torque", "speed", "load") or wheel not in rig.wheels:
@@ -212,7 +212,7 @@ def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
 
 
 def frozen(data: ConsistencyInput) -> Iterator[str]:
-    """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
+    """Yield channels that read the very same for longer than their noise allows, while the vehicle drives."""
     options = data.options
     window, rig = data.raw, data.rig
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
@@ -253,7 +253,7 @@ def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolu
 
 
 def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
-    """Speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed where all of them rest."""
+    """Yield the speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed if all rest."""
     options = data.options
     window, rig = data.window, data.rig
     ground = window.ground_speed[:, None]
@@ -272,7 +272,7 @@ def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
 
 
 def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
-    """Of a wheel and its motor, whose speeds do not go together, the one farther from the other wheels'.
+    """Yield the speed that is farther from the other wheels' where a wheel and its motor disagree.
 
     Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
     """
@@ -300,7 +300,7 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
 
 
 def load_sum(data: ConsistencyInput) -> Iterator[str]:
-    """The load that alone explains why the loads do not add up to the weight; all of them where nothing else can."""
+    """Yield the load that alone explains why the loads do not add up to the weight; all where none can."""
     options = data.options
     window, rig, chassis = data.window, data.rig, data.rig.chassis
     if chassis is None or set(rig.front.tolist()) != {True, False}:
@@ -337,7 +337,7 @@ def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
 
 
 def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
-    """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
+    """Yield the acceleration where it says that the vehicle slows down whenever it speeds up."""
     window, lag = data.window, data.sustained
     gained = change(smooth(window.ground_speed), lag)
     reported = data.bin * moving_sum(_without_slope(data), lag)
@@ -354,7 +354,7 @@ def _without_slope(data: ConsistencyInput) -> Array:
 
 
 def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
-    """Torques, speeds or the ground speed of wheels that slip without driving, or drive without slipping."""
+    """Yield torques or speeds of wheels that slip without driving, or drive without slipping."""
     options = data.options
     rig, slip, grip = data.rig, data.slip, data.traction
     with np.errstate(invalid="ignore"):
@@ -379,7 +379,7 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
 
 
 def wheel_derived_speed(data: ConsistencyInput) -> Iterator[str]:
-    """The ground speed, where it is the rim speed of an axle or of all wheels, which pull without any slip."""
+    """Yield the ground speed where it is the rim speed of wheels that pull, so without any slip."""
     options, every = data.options, list(range(len(data.rig.wheels)))
     for wheels in (*data.rig.axles, every):
         slip, grip = data.slip[:, wheels].mean(axis=1), data.traction[:, wheels].mean(axis=1)
@@ -400,7 +400,7 @@ def _pulls(data: ConsistencyInput, where: Mask) -> bool:
 
 
 def speed_scale(data: ConsistencyInput) -> Iterator[str]:
-    """Ground speed or acceleration, where the one changes several tenths more or less than the other says.
+    """Yield ground speed or acceleration, whichever changes several tenths more or less than the other says.
 
     Where the ground speed jumps it is the one; where the slip would be impossible with the
     one false it is the other; else it may be either, and both are named.
@@ -475,7 +475,7 @@ def _jumps(data: ConsistencyInput) -> bool:
 
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
-    """The draft, where the vehicle is pushed, and the more so whenever its wheels drive more; needs slope and inertia.
+    """Yield the draft where it pushes the vehicle, and the more so the more its wheels drive.
 
     On soft ground it may also pull less when its wheels drive more, for they sink; but it pulls.
     """
@@ -510,33 +510,33 @@ def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], noise: tuple
 
 
 def running_sum(values: NDArray[Any], n: int) -> Array:
-    """Sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
+    """Return the sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
     return np.convolve(values, np.ones(n), "valid") if len(values) >= n else np.zeros(0)
 
 
 def change(values: Array, lag: int) -> Array:
-    """Changes (N - lag,) over `lag` bins of values (N,), in their unit."""
+    """Return the changes (N - lag,) over `lag` bins of values (N,), in their unit."""
     return values[lag:] - values[:-lag]
 
 
 def change_variance(variance: Array, lag: int) -> Array:
-    """Variances (N - lag,) of such changes, where those of the values (N,) are independent."""
+    """Return the variances (N - lag,) of such changes where values (N,) have independent variances."""
     return variance[lag:] + variance[:-lag]
 
 
 def smooth(values: Array) -> Array:
-    """Means (N,) of each three neighbours."""
+    """Return the means (N,) of each three neighbours."""
     wide = np.concatenate([values[:1], values, values[-1:]])
     return np.asarray((wide[:-2] + wide[1:-1] + wide[2:]) / 3.0)
 
 
 def moving_sum(values: Array, lag: int) -> Array:
-    """Sums (N - lag,) from each bin's middle to that of the one `lag` later."""
+    """Return the sums (N - lag,) from each bin's middle to that of the one `lag` later."""
     return running_sum((values[1:] + values[:-1]) / 2.0, lag)
 
 
 def neighbours(values: Array, n: int) -> Array:
-    """Each n neighbours of (N,), (N - n + 1, n).
+    """Return each n neighbours of (N,), (N - n + 1, n).
 
     Not numpy's view of them: each call leaves a used place in Python's table of strings, which after hours doubles.
     """
@@ -544,20 +544,20 @@ def neighbours(values: Array, n: int) -> Array:
 
 
 def median(values: Array) -> float:
-    """Median of what is known; nan of nothing."""
+    """Return the median of the known values; nan of none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else math.nan
 
 
 def lasts(holds: Mask, bins: int) -> bool:
-    """Whether something holds in this number of bins in a row."""
+    """Return whether something holds in this number of bins in a row."""
     if np.count_nonzero(holds) < bins:
         return False
     return any(last - first >= bins for first, last in runs(holds))
 
 
 def runs(holds: Mask) -> list[tuple[int, int]]:
-    """First index of each run of True, and the index after its last."""
+    """Return the first index of each run of True, and the index after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

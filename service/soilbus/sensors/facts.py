@@ -111,11 +111,11 @@ class Finding(NamedTuple):
 
 
 class UndecidableError(Exception):
-    """The recording cannot decide a check; the text says which and why."""
+    """Error of a recording that cannot decide a check; the text says which and why."""
 
 
 class Facts(NamedTuple):
-    """A recording in N bins.
+    """Recording in N bins, as the checks of `check --log` see it.
 
     raw, window: as measured, and turned forward; straight (N,): where the vehicle drives straight on; motor (N, W):
     motor speeds [rad/s]; shaft: those of motors of axles (N,), by axle; mapped: names of the mapped channels;
@@ -144,7 +144,7 @@ class Facts(NamedTuple):
         return np.where(self.straight[:, None], self.window.torque / self.rig.radius, np.nan)
 
     def less(self, channels: Iterable[str]) -> Facts:
-        """The same without these channels."""
+        """Return the recording without these channels."""
         gone = set(channels)
         motor = np.where([f"motor_speed.{w}" in gone for w in self.rig.wheels], np.nan, self.motor)
         return self._replace(
@@ -153,7 +153,7 @@ class Facts(NamedTuple):
 
 
 def regression(y: Array, x: Array) -> tuple[Array, Array]:
-    """Least-squares coefficients (K,) of y (N,) on the columns of x (N, K), and their standard deviations."""
+    """Return the least-squares coefficients (K,) of y (N,) on the columns of x (N, K), and their std."""
     inverse = np.linalg.pinv(x.T @ x)
     factors = inverse @ x.T @ y
     residual_variance = float(((y - x @ factors) ** 2).sum()) / max(len(y) - x.shape[1], 1)
@@ -161,18 +161,18 @@ def regression(y: Array, x: Array) -> tuple[Array, Array]:
 
 
 def steps(facts: Facts) -> tuple[int, int]:
-    """Bins in the second over which changes are compared, and in the half second over which they are averaged."""
+    """Return the bins over which changes are compared (a second) and averaged (half a second)."""
     bin_length = facts.config.estimator.bin
     return max(round(1.0 / bin_length), 1), max(round(0.5 / bin_length), 1)
 
 
 def spread(values: Array) -> float:
-    """Standard deviation of what is known; 0 of nothing."""
+    """Return the standard deviation of the known values; 0 of none."""
     known = values[np.isfinite(values)]
     return float(known.std()) if len(known) else 0.0
 
 
 def block_means(values: Array, n: int) -> Array:
-    """Means of each n rows."""
+    """Return the means of each n rows."""
     whole = len(values) // n * n
     return np.asarray(values[:whole].reshape(-1, n, values.shape[1]).mean(axis=1))

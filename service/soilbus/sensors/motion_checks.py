@@ -63,7 +63,7 @@ def _driven_axles(facts: Facts) -> dict[str, list[int]]:
 
 
 class Felt(NamedTuple):
-    """What an accelerometer's readings are made of, with standard deviations, and the sd of the slope [m/s^2]."""
+    """Parts of an accelerometer's readings, with standard deviations, and the sd of the slope [m/s^2]."""
 
     of_speed: float
     of_slope: float
@@ -73,7 +73,7 @@ class Felt(NamedTuple):
 
     @property
     def shows_slope(self) -> bool:
-        """Whether gravity is felt or not beyond doubt."""
+        """Whether the readings decide if gravity is felt."""
         return self.slope > GRAVITY * LIMITS.tilted and LIMITS.side_sd * self.slope_sd < 0.5
 
 

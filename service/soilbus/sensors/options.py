@@ -15,7 +15,7 @@ __all__ = ["CONSISTENCY", "RECEPTION", "ConsistencyOptions", "ReceptionOptions"]
 
 @dataclass(frozen=True, slots=True)
 class ReceptionOptions:
-    """Which samples are outliers, how short bins are, and which windows have data enough."""
+    """Tuning values of reception: outliers, length of bins, data enough for a window."""
 
     outlier_sd: float = 6.5
     """Distance from the line [sd] from which a sample may be an outlier, by the sensor's noise and by the channel's own
@@ -47,7 +47,7 @@ RECEPTION = ReceptionOptions()
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyOptions:
-    """When a sensor contradicts the others.
+    """Tuning values of the consistency checks: when a sensor contradicts the others.
 
     Each limit lies beyond what soils, slopes, drivers and the effects of `terra.effects` make of good sensors
     (`tests/estimation/test_plausibility.py`); traction is torque over load and radius.

@@ -41,11 +41,11 @@ class Samples(NamedTuple):
     settled: Mask
 
     def pick(self, which: Mask | NDArray[np.intp]) -> Samples:
-        """Those of a mask (N,) or of indices."""
+        """Return the samples of a mask (N,) or of indices."""
         return Samples(self.column[which], self.t[which], self.value[which], self.settled[which])
 
     def in_order(self) -> Samples:
-        """The same, channel after channel, each in the order of time (and of value at the same time)."""
+        """Return the samples channel after channel, each in the order of time."""
         ordered = self.pick(np.argsort(self.column, kind="stable"))
         same = ordered.column[1:] == ordered.column[:-1]
         if (same & ~(ordered.t[1:] > ordered.t[:-1])).any():
@@ -54,7 +54,7 @@ class Samples(NamedTuple):
 
 
 class Tested(NamedTuple):
-    """Samples in order, which are outliers, and how many of its channel follow each one; each (N,)."""
+    """Samples in order, which of them are outliers, and how many of their channel follow each one; each (N,)."""
 
     samples: Samples
     outlier: Mask
@@ -142,7 +142,7 @@ def _vibration(
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
-    """All samples of the parts."""
+    """Return all samples of the parts."""
     columns, t, value, settled = zip(*(parts or (NO_SAMPLES,)), strict=True)
     return Samples(np.concatenate(columns), np.concatenate(t), np.concatenate(value), np.concatenate(settled))
 

@@ -57,7 +57,7 @@ class _Binned(NamedTuple):
 
 
 def resolved_window(store: Bins, end: float) -> Window:
-    """All samples of a store from its origin to `end`, in bins as short as its spectrum asks for.
+    """Return all samples of a store from its origin to `end`, in bins as short as its spectrum asks for.
 
     Parameters
     ----------

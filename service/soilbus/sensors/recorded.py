@@ -22,7 +22,7 @@ BATCH_SIZE = 5000
 
 
 def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns, Counter[tuple[str, Reason]], int]:
-    """Samples of the part with most of them, refused values by channel and reason, and the number of frames.
+    """Return the samples of the longest part, and refused values and number of frames of all parts.
 
     Parameters
     ----------

@@ -59,14 +59,14 @@ class Recording:
     seconds: float
 
     def mean(self, path: str, edges: Array) -> Array:
-        """Means over the bins between edges [s]; nan where there is no sample."""
+        """Return the means over the bins between edges [s]; nan where there is no sample."""
         t, value = self.columns.get(path, (np.empty(0), np.empty(0)))
         count, total = np.histogram(t, edges)[0], np.histogram(t, edges, weights=value)[0]
         return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
     @property
     def edges(self) -> Array:
-        """Of bins over the whole recording [s]."""
+        """Edges [s] of bins over the whole recording."""
         ends = [(t[0], t[-1]) for t, _ in self.columns.values()]
         start, end = (min(a for a, _ in ends), max(b for _, b in ends)) if ends else (0.0, 0.0)
         return np.asarray(np.arange(start, end + BIN, BIN))
@@ -91,7 +91,7 @@ class Facts:
 
 
 def recording_of(found: Iterable[Candidate], database: Database, frames: Iterable[Frame]) -> Recording:
-    """The samples of all candidates' signals in one recording."""
+    """Return the samples of all candidates' signals in one recording."""
     channels: dict[str, Channel] = {}
     owner: dict[tuple[int, bool], str] = {}
     for c in found:
@@ -114,7 +114,7 @@ def recording_of(found: Iterable[Candidate], database: Database, frames: Iterabl
 
 
 def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]:
-    """The candidates with what the recording says for or against each."""
+    """Return the candidates with what the recording says for or against each."""
     out = []
     known = list(found)
     turning = _turning(known, recording)
@@ -133,7 +133,7 @@ def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]
 
 
 def facts_of(assignment: Assignment, recording: Recording) -> Facts:
-    """Gear ratios, signs, kind of the accelerometer, mass and radii, from what is asserted."""
+    """Return gear ratios, signs, kind of the accelerometer, mass and radii, by the asserted signals."""
     asserted, edges = assignment.asserted, recording.edges
 
     def read(role: str, place: str = "") -> Array:

@@ -57,7 +57,7 @@ class Seen:
 
 
 def si_unit(channel: Channel) -> str:
-    """SI unit of a channel's values; "" of a code."""
+    """Return the SI unit of a channel's values; "" of a code."""
     return "" if channel.quantity == LOCK else SI.get(_dimension(channel), "")
 
 

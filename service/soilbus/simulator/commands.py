@@ -47,7 +47,7 @@ class Commands:
         self._values: dict[str, tuple[float, dict[str, float]]] = {}
 
     def take(self, frame: can.Message, now: float) -> bool:
-        """Note a frame that came at a time `now` [s]; whether it is a command and right."""
+        """Note a frame that came at a time `now` [s]; return whether it is a command and right."""
         message = self._messages.get(frame.arbitration_id) if frame.is_extended_id else None
         data = bytes(frame.data)
         if message is None or frame.is_remote_frame or len(data) != message.length:
@@ -66,7 +66,7 @@ class Commands:
         return True
 
     def at(self, now: float) -> Command:
-        """What is commanded at a time [s]."""
+        """Return the commands in force at a time [s]."""
         drive, limits = (self._fresh(name, now) for name in (_DRIVE, _TORQUE_LIMIT))
         signals = ("LimitFL", "LimitFR", "LimitRL", "LimitRR")
         return Command(

@@ -22,7 +22,7 @@ __all__ = ["NORTHWARD", "Course", "course", "positions"]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A start, a heading and rows.
+    """Course of a drive over the ground: a start, a heading and rows.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Course:
 
 
 def course(start: Sequence[float] | None = None, heading: float = 0.0, rows: Sequence[float] | None = None) -> Course:
-    """A course from degrees.
+    """Return a course from degrees.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ NORTHWARD = Course()
 
 
 def positions(course: Course, distance: Array) -> tuple[Array, Array]:
-    """Positions on a course.
+    """Return the positions on a course.
 
     Parameters
     ----------

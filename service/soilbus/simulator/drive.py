@@ -62,7 +62,7 @@ _LARGEST_LOSS = 0.9
 
 
 class SimulationError(Exception):
-    """The scenario cannot be driven with this configuration; one line says why."""
+    """Error of a scenario that cannot be driven with this configuration; one line says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Commands to the vehicle; where there is none the scenario holds.
+    """Commands to the vehicle; without one the scenario holds.
 
     Attributes
     ----------
@@ -189,7 +189,7 @@ def steps(
     step: float = STEP,
     commanded: Callable[[float], Command] = lambda t: NO_COMMAND,
 ) -> Iterator[Drive]:
-    """A drive, a step after the other; it ends with the scenario or where the vehicle has bogged down.
+    """Yield a drive step by step, until the scenario ends or the vehicle has bogged down.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def steps(
 
 
 def joined(drives: Sequence[Drive]) -> Drive:
-    """One drive of several that follow one another."""
+    """Return one drive of several that follow one another."""
     if len(drives) == 1:
         return drives[0]
     last = drives[-1]
@@ -235,7 +235,7 @@ def joined(drives: Sequence[Drive]) -> Drive:
 
 
 def latest(done: Drive, n: int) -> Drive:
-    """The last n instants of a drive."""
+    """Return the last n instants of a drive."""
     around: Any = done.surroundings
     return replace(
         done,

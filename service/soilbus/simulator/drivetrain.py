@@ -34,7 +34,7 @@ _OF_DRIVE = {"torque", "torque_limit", "max_torque", "motor_speed", "differentia
 
 @dataclass(frozen=True, slots=True)
 class Drivetrain:
-    """Conditions of the M wheels, one row each, and the torques that are limited.
+    """Drive line of M wheels: one condition a row, and the torques that are limited.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Drivetrain:
 
 
 def own_motors(limit: Sequence[float] | Array) -> Drivetrain:
-    """A motor for each wheel, with these limits [N m] (M,); inf for none."""
+    """Return a motor for each wheel, with these limits [N m] (M,); inf for none."""
     n = len(limit)
     return Drivetrain(
         np.eye(n), np.zeros((n, n)), np.zeros(n), np.ones(n, bool), np.arange(n), np.eye(n), np.asarray(limit, float)
@@ -71,7 +71,7 @@ def own_motors(limit: Sequence[float] | Array) -> Drivetrain:
 
 
 def drivetrain_of(config: Config) -> Drivetrain:
-    """The drive line that the configuration describes.
+    """Return the drive line that the configuration describes.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ _COARSE_STRIDE = 10
 
 
 class Situation(NamedTuple):
-    """What is given at N instants for M wheels; all arrays end in N.
+    """Given quantities at N instants for M wheels; all arrays end in N.
 
     Attributes
     ----------
@@ -102,12 +102,12 @@ class Situation(NamedTuple):
     least_draft: Array
 
     def load(self, draft: Array) -> Array:
-        """Wheel loads [N] (M, N)."""
+        """Return the wheel loads [N] (M, N)."""
         cosine = np.sqrt(1.0 - self._sine(draft) ** 2)
         return np.asarray(self.level_load + self.load_per_draft * draft + self.upright_load * (cosine - 1.0))
 
     def load_slope(self, draft: Array) -> Array:
-        """Derivatives (M, N) of the wheel loads by the draft."""
+        """Return the derivatives (M, N) of the wheel loads by the draft."""
         sine, weight = self._sine(draft), self.level_load.sum(axis=0)
         return np.asarray(self.load_per_draft - self.upright_load * sine / np.sqrt(1.0 - sine**2) / weight)
 
@@ -184,7 +184,7 @@ class Equilibrium(NamedTuple):
 
 
 def solve(situation: Situation, mechanics: Mechanics, near: Equilibrium | None = None) -> Equilibrium:
-    """The equilibrium at each instant.
+    """Return the equilibrium at each instant.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def _from_near(situation: Situation, mechanics: Mechanics, guess: _Guess) -> Equ
 
 
 def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft: Array) -> Surroundings:
-    """What effects may depend on.
+    """Return what effects may depend on.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft:
 
 
 def sinkages(situation: Situation, mechanics: Mechanics, at: Equilibrium) -> Array:
-    """Sinkages [m] (M, N), for the wheel radii that effects leave."""
+    """Return the sinkages [m] (M, N), with the radii that effects give the wheels."""
     slip = wheel_slips(situation, at)
     state, around = _transposed(situation, slip, at.entry_angle), surroundings(situation, mechanics, slip, at.draft)
     changed, _ = wheel_with(mechanics.effects, state, mechanics.model, around)
@@ -272,7 +272,7 @@ def sinkages(situation: Situation, mechanics: Mechanics, at: Equilibrium) -> Arr
 
 
 def wheel_slips(situation: Situation, at: Equilibrium) -> Array:
-    """Slips of the wheels (M, N)."""
+    """Return the slips of the wheels (M, N)."""
     return np.asarray(at.slip + situation.deviation + at.lead)
 
 
@@ -282,7 +282,7 @@ def _transposed(situation: Situation, slip: Array, entry_angle: Array) -> WheelS
 
 
 def wheel_state(situation: Situation, slip: Array, entry_angle: Array) -> WheelState:
-    """States of all wheels (M, N) at their slips (M, N) and entry angles [rad] (M, N)."""
+    """Return the states of all wheels (M, N) at their slips (M, N) and entry angles [rad] (M, N)."""
     soil = Soil(*situation.soil)
     return state_on(soil, entry_angle, slip, situation.radius, situation.width, situation.length)
 

@@ -45,7 +45,7 @@ Payload = NDArray[np.uint8]
 def frames(
     recording: Recording, config: Config, database: Database | None = None, start: float = START_TIME
 ) -> Iterator[can.Message]:
-    """The recording's frames in the order of their stamps.
+    """Yield the recording's frames in the order of their stamps.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def frames(
 
 
 class Encoder:
-    """The vehicle's frames, for a drive that comes step by step: counters and jitter go on from step to step.
+    """Encoder of the vehicle's frames, step by step: counters and jitter go on.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Encoder:
         self._last: dict[str, Column] = {}
 
     def frames(self, channels: Mapping[str, Column], truth: Mapping[str, NDArray[Any]]) -> Iterator[can.Message]:
-        """The frames of the next step, from its samples and its true values by channel and column name."""
+        """Yield the frames of the next step, from its samples and its true values by channel and column name."""
         held = {name: _after(self._last.get(name), column) for name, column in channels.items()}
         times: list[Array] = []
         payloads: list[Payload] = []
@@ -123,7 +123,7 @@ def _after(last: Column | None, column: Column) -> Column:
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:
-    """Payloads from raw codes.
+    """Return payloads from raw codes.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ Step = tuple[Drive, list[can.Message]]
 def driven_frames(
     config: Config, scenario: Scenario, seed: int, commanded: Callable[[float], Command]
 ) -> Iterator[Step]:
-    """A drive with its frames, a step after the other.
+    """Yield a drive with its frames, step by step.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """Values at times, with straight lines between them.
+    """Manoeuvre: values at times, with straight lines between them.
 
     Attributes
     ----------
@@ -62,16 +62,16 @@ class Manoeuvre:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.t[-1]
 
     def repeated(self, times: int) -> Manoeuvre:
-        """The same several times in a row."""
+        """Return the manoeuvre several times in a row."""
         t = tuple(round(i * (self.duration + GAP) + at, 6) for i in range(times) for at in self.t)
         return replace(self, t=t, **{name: getattr(self, name) * times for name in COLUMNS})
 
     def over(self, scenario: Scenario, nothing_towed: bool = False) -> Scenario:
-        """A scenario's ground driven so; a vehicle that tows nothing finds its own slopes for the slip."""
+        """Return a scenario in which the manoeuvre is driven on the ground of another."""
         t, speed = np.array(self.t), np.array(self.speed)
         distance = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2.0 * np.diff(t))])
         slope = ((0.0, 0.0),) if nothing_towed else tuple(zip(distance.tolist(), self.slope, strict=True))
@@ -86,12 +86,12 @@ class Manoeuvre:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Plain objects, which of_json() reads."""
+        """Return plain objects, which of_json() reads."""
         return asdict(self)
 
 
 def of_json(text: str) -> Manoeuvre:
-    """A manoeuvre from JSON: of its own, or the `manoeuvre` of a diagnosis.
+    """Return a manoeuvre from its JSON, or from the `manoeuvre` of a diagnosis.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def scenario_over(
     speed: float | None = None,
     vehicle_seed: int | None = None,
 ) -> Scenario:
-    """A scenario over several soils, each for an equal part of the time.
+    """Return a scenario over several soils, each for an equal part of the time.
 
     Parameters
     ----------

@@ -63,5 +63,5 @@ def simulate(config: Config, scenario: Scenario, seed: int, effects: Sequence[Ac
 
 
 def recorded(done: Drive, config: Config, scenario: Scenario, seed: int) -> Recording:
-    """The recording of a drive through a scenario, by the sensors of `config` (as `simulate`)."""
+    """Return the recording of a drive through a scenario, by the sensors of `config` (as `simulate`)."""
     return Recording(done.columns, measure(done, config, seed, scenario.vehicle_seed), seed, done.bogged_at)

@@ -21,5 +21,5 @@ REFERENCES = {path.stem: path for path in (TRACTOR, REAR_DRIVE, AXLE_MOTORS)}
 
 
 def reference_configuration(overrides: Iterable[str] = (), path: Path = TRACTOR) -> Config:
-    """Configuration of the reference tractor or another machine; ConfigError for a wrong override."""
+    """Return the configuration of the reference tractor or another machine; ConfigError for a wrong override."""
     return load_config(path, overrides)

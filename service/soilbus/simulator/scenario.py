@@ -90,7 +90,7 @@ class Wave(NamedTuple):
 
 
 def realise(swing: Swing | Profile, t: Array, rng: np.random.Generator) -> Wave:
-    """A random wave.
+    """Return a random wave.
 
     Parameters
     ----------
@@ -127,20 +127,20 @@ def realise(swing: Swing | Profile, t: Array, rng: np.random.Generator) -> Wave:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Soil from a distance [m] on; a name of terra.soils, or the soil itself with a name."""
+    """Soil from a distance [m] on: a name of terra.soils, or the soil itself with a name."""
 
     start: float
     name: str
     soil: Soil | None = None
 
     def parameters(self) -> Soil:
-        """The soil; KeyError for a name that terra.soils does not know."""
+        """Return the soil; KeyError for a name that terra.soils does not know."""
         return self.soil if self.soil is not None else soil_named(self.name)
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One drive.
+    """Scenario of one drive.
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ class Scenario:
 
     @property
     def lifted(self) -> bool:
-        """Whether slip is limited by a driver who lifts the implement, or prescribed."""
+        """Whether a driver who lifts the implement limits the slip, or it is prescribed."""
         return self.slip is not None or self.lift_slip is not None
 
     def __post_init__(self) -> None:
@@ -210,7 +210,7 @@ class Scenario:
 
 
 def oscillation(t: Array, rng: np.random.Generator) -> Array:
-    """A lightly damped mode of an axle on its tyres, driven by random ground; (N,) at SAMPLE_RATE, of unit rms.
+    """Return a lightly damped mode of an axle on its tyres, driven by random ground; (N,), of unit rms.
 
     x'' + 2 zeta w x' + w^2 x = white noise, sampled without error: an autoregression of second order
     """
@@ -227,7 +227,7 @@ def oscillation(t: Array, rng: np.random.Generator) -> Array:
 
 
 def soil_along(patches: Sequence[Patch], position: Array, transition: float) -> Soil:
-    """Soil parameters at positions [m] of any shape: a Soil of arrays of that shape."""
+    """Return the soil parameters at positions [m] of any shape: a Soil of arrays of that shape."""
     rows = [np.array(patch.parameters()) for patch in patches]
     values = np.multiply.outer(rows[0], np.ones_like(position))
     for patch, before, after in zip(patches[1:], rows, rows[1:], strict=False):
@@ -237,18 +237,18 @@ def soil_along(patches: Sequence[Patch], position: Array, transition: float) -> 
 
 
 def soil_names(patches: Sequence[Patch], position: Array) -> list[str]:
-    """Name of the soil at each position [m] (N,)."""
+    """Return the name of the soil at each position [m] (N,)."""
     index = np.searchsorted([patch.start for patch in patches[1:]], position, side="right")
     return [patches[int(i)].name for i in index]
 
 
 def excited(soil: str = "loam", duration: float = 120.0) -> Scenario:
-    """One soil, slip swept from 0.05 to 0.4: the drive whose window determines the soil best."""
+    """Return one soil with slip swept from 0.05 to 0.4: the drive that determines the soil best."""
     return Scenario(duration, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
 
 
 def demo(duration: float = 60.0, first: str = "loam", second: str = "wet_clay") -> Scenario:
-    """Half the time on the first soil, then the same work on the second.
+    """Return half the time on the first soil, then the same work on the second.
 
     The draft asked for is easy on loam and more than wet clay can hold: there the driver
     lifts the implement to get through at all, at slips that a careful driver avoids.

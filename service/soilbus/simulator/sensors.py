@@ -40,7 +40,7 @@ _NOISELESS = frozenset({"torque_limit", LOCK})
 
 
 def channel_rng(seed: int, name: str) -> np.random.Generator:
-    """Random numbers of one channel or message; they do not depend on which other channels exist."""
+    """Return random numbers of one channel or message, whichever other channels exist."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
@@ -57,12 +57,12 @@ class Sensor(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of its channel."""
+        """Name of its channel."""
         return f"{self.quantity}.{self.part}" if self.part else self.quantity
 
 
 def sensors(config: Config) -> Iterator[Sensor]:
-    """Every sensor that the configuration maps, in the order of its channels."""
+    """Yield every sensor that the configuration maps, in the order of its channels."""
     seen: set[tuple[str, str]] = set()
     for wheel in config.wheel:
         for quantity in WHEEL_ROLES:
@@ -104,13 +104,13 @@ def _of_axle(config: Config, axle: Axle, quantity: str) -> dict[str, float]:
 
 
 def fitted(config: Config) -> Iterator[tuple[str, str]]:
-    """(quantity, wheel, axle or "") of every channel that the configuration maps."""
+    """Yield (quantity, wheel, axle or "") of every channel that the configuration maps."""
     for sensor in sensors(config):
         yield sensor.quantity, sensor.part
 
 
 def measure(drive: Drive, config: Config, seed: int, vehicle_seed: int | None = None) -> dict[str, Column]:
-    """Noisy samples of every mapped channel.
+    """Return the noisy samples of every mapped channel.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def measure(drive: Drive, config: Config, seed: int, vehicle_seed: int | None = 
 
 
 class Instruments:
-    """The sensors of one vehicle, for a drive that comes step by step.
+    """Sensors of one vehicle, which measure a drive step by step.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ class Instruments:
         self._seen = 0
 
     def measure(self, step: Drive) -> dict[str, Column]:
-        """Samples of the next step of a drive, as `measure`."""
+        """Return the samples of the next step of a drive, as `measure`."""
         n = len(step.columns["t"])
         known = step if self._before is None else joined([self._before, step])
         self._before = latest(known, round(HISTORY * SAMPLE_RATE))
@@ -199,14 +199,14 @@ def _noise_of(config: Config, sensor: Sensor) -> Noise:
 
 
 def true_speed(true_columns: Mapping[str, NDArray[Any]], config: Config, part: str) -> Array:
-    """Rotation [rad/s] (N,) of a wheel, or the mean of an axle's wheels, at the wheels' side of the motor's gear."""
+    """Return the rotation [rad/s] (N,) of a wheel, or the mean of an axle's wheels."""
     axle = next((axle for axle in config.axle if axle.name == part), None)
     weight = {part: 1.0} if axle is None else _of_axle(config, axle, "speed")
     return _true_reading(true_columns, "speed", weight)
 
 
 def true_readings(true_columns: Mapping[str, NDArray[Any]], config: Config, names: Iterable[str]) -> dict[str, Array]:
-    """What the sensors of these channels read without errors and effects (N,), from the true columns of a drive."""
+    """Return what the sensors of these channels read without errors and effects (N,)."""
     columns = dict(true_columns) | _straight_on(true_columns, config)
     of_channel = {sensor.name: sensor for sensor in sensors(config)}
     quantity = {name: of_channel[name].quantity for name in names}
@@ -265,7 +265,7 @@ def _late(drive: Drive, true_columns: dict[str, NDArray[Any]], wheels: list[str]
 
 
 def noise_sd(truth: Array, noise: Noise, window: float) -> Array:
-    """Standard deviation of the noise of each reading.
+    """Return the standard deviation of the noise of each reading.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ class Stress(NamedTuple):
 
 
 def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
-    """Of the soil alone, without its pan."""
+    """Return the stresses of the soil alone, without a hardpan."""
     theta, slip, r, _, K_L, n, _, _, K, _ = state
     q, exit_varies = model.quadrature, model.exit_angle or model.exit_slip
     if exit_varies:
@@ -74,20 +74,20 @@ def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
 
 
 def peaking(slip: Array, model: WheelModel) -> Array:
-    """Derivative (N,) by the slip of the angle of greatest stress over the entry angle."""
+    """Return the derivative (N,) by slip of the angle of greatest stress over the entry angle."""
     share = model.peak(slip)
     slope = model.peak_c2 * (1.0 + model.peak_bend) / (1.0 + model.peak_bend * np.abs(slip)) ** 2
     return np.where((share > PEAK[0]) & (share < PEAK[1]), slope, 0.0)
 
 
 def leaving(theta: Array, slip: Array, model: WheelModel) -> tuple[Array, Array]:
-    """Derivatives (N,) by entry angle and slip of the exit angle over the entry angle."""
+    """Return the derivatives (N,) by entry angle and slip of the exit angle over the entry angle."""
     free = model.leave(theta, slip) > -LONGEST
     return np.where(free, -model.exit_angle / theta**2, 0.0), np.where(free & (slip > 0.0), model.exit_slip, 0.0)
 
 
 def mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
-    """Mobilised share of the shear strength and its derivative by j/K."""
+    """Return the mobilised share of the shear strength and its derivative by j/K."""
     share, slope = SHEAR_LAWS[model.shear_law](j_K)
     if not model.exponential_share:
         return share, slope
@@ -96,7 +96,7 @@ def mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
 
 
 def sheared(at: Stress, state: WheelState) -> tuple[Array, Array]:
-    """Shear stress and its derivative by j/K."""
+    """Return the shear stress and its derivative by j/K."""
     tau = state.tan_phi * at.rubbed + state.c * at.stuck
     mobilising = state.tan_phi * at.normal
     mobilising += state.c * at.weight
@@ -105,7 +105,7 @@ def sheared(at: Stress, state: WheelState) -> tuple[Array, Array]:
 
 
 def entering(at: Stress, state: WheelState, tau: Array, mobilising: Array) -> tuple[Array, Array]:
-    """Fields by the entry angle: stresses grow, and the nodes turn with it.  The torque wants Q + share normal."""
+    """Return the derivatives of the stresses by the entry angle, which also turns the nodes."""
     normal = at.steep * (state.n * at.rim.deepening)
     rate = state.slip * at.rim.travel_rate
     rate += at.rim.creep_rate
@@ -119,7 +119,7 @@ def entering(at: Stress, state: WheelState, tau: Array, mobilising: Array) -> tu
 
 
 def unit_of(state: WheelState) -> Array:
-    """What turns an integral over shares of the entry angle into W, DP and T (3, N)."""
+    """Return the factors (3, N) from an integral over shares of the entry angle to W, DP and T."""
     area = state.radius * state.width * state.entry_angle
     unit = np.empty((3, *area.shape))
     unit[:2] = area
@@ -128,7 +128,7 @@ def unit_of(state: WheelState) -> Array:
 
 
 def integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
-    """What fields (F, 2, M, N), the first few of normal stress and the rest of shear, add to W, DP and T (3, F, N)."""
+    """Return what fields (F, 2, M, N), of normal stress first, then of shear, add to W, DP and T (3, F, N)."""
     along, across = np.einsum("fbmn,bmn->fn", fields, rim.cos), np.einsum("fbmn,bmn->fn", fields, rim.sin)
     out = np.empty((3, *along.shape))
     normal, shear = slice(n_normal), slice(n_normal, None)
@@ -140,7 +140,7 @@ def integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
 
 
 def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
-    """Derivatives (3, N) of the integrals by the ratio of the angle of greatest stress to the entry angle."""
+    """Return the derivatives (3, N) of the integrals by the angle of greatest stress over the entry angle."""
     rim, peak = at.rim, model.peak(state.slip)
     turn = state.entry_angle * (1.0 - at.share[0]) / (1.0 - peak)
     spread = np.stack([-1.0 / (1.0 - peak), np.broadcast_to(1.0 / (peak - at.leave), np.shape(peak))])[:, None]
@@ -155,7 +155,7 @@ def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobili
 
 
 def by_leave(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
-    """Derivatives (3, N) of the integrals by the ratio of the exit angle to the entry angle: of the rear branch."""
+    """Return the derivatives (3, N) of the integrals by the exit angle over the entry angle."""
     sin, cos = at.rim.sin[1], at.rim.cos[1]
     length = model.peak(state.slip) - at.leave
     turn = state.entry_angle * (at.leave + length - at.share[1]) / length
@@ -168,6 +168,6 @@ def by_leave(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobil
 
 
 def by_exponential_share(at: Stress, state: WheelState, model: WheelModel) -> Array:
-    """Derivatives (3, N) of the integrals by the share of the strength that is mobilised exponentially."""
+    """Return the derivatives (3, N) of the integrals by the share of the strength that is mobilised exponentially."""
     more = SHEAR_LAWS["exponential"](at.j_K)[0] - SHEAR_LAWS[model.shear_law](at.j_K)[0]
     return integrals(((state.tan_phi * at.normal + state.c * at.weight) * more)[None], 0, at.rim)[:, 0]

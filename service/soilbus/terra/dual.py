@@ -68,23 +68,23 @@ class Dual(NDArrayOperatorsMixin):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the value."""
+        """Shape of the value."""
         return np.shape(self.value)
 
     @property
     def ndim(self) -> int:
-        """Of the value."""
+        """Number of dimensions of the value."""
         return np.ndim(self.value)
 
     def __getitem__(self, index: Any) -> Dual:
         return self._each(lambda a: a[index])
 
     def sum(self, axis: int) -> Dual:
-        """As numpy's."""
+        """Return the sum over axes, as numpy does."""
         return self._each(lambda a: a.sum(axis=axis))
 
     def only(self, kind: type) -> Dual:
-        """Without the derivatives by quantities that are not of this type."""
+        """Return the number without derivatives by quantities that are not of this type."""
         return Dual(self.value, {q: d for q, d in self.by.items() if isinstance(q, kind)})
 
     def _each(self, linear: Any) -> Dual:
@@ -93,7 +93,7 @@ class Dual(NDArrayOperatorsMixin):
 
 
 def weighed_sum(weights: Any, numbers: Sequence[Any]) -> Any:
-    """The sum (...) of weights (K, ...) times K numbers, that may carry derivatives by numbers."""
+    """Return the sum (...) of weights (K, ...) times K numbers, which may carry derivatives."""
     value = np.tensordot([value_of(x) for x in numbers], weights, 1)
     by: dict[Any, Any] = {}
     for x, weight in zip(numbers, weights, strict=True):
@@ -103,10 +103,10 @@ def weighed_sum(weights: Any, numbers: Sequence[Any]) -> Any:
 
 
 def value_of(x: Any) -> Any:
-    """A number without its derivatives."""
+    """Return a number without its derivatives."""
     return x.value if isinstance(x, Dual) else x
 
 
 def slope_of(x: Any, quantity: Hashable) -> Any:
-    """Its derivative by a quantity, zero where it carries none."""
+    """Return a number's derivative by a quantity; zero where it carries none."""
     return x.by.get(quantity, 0.0) if isinstance(x, Dual) else 0.0

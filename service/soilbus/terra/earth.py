@@ -14,12 +14,12 @@ _ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 
 
 def wrapped(longitude: ArrayLike) -> Array:
-    """The same longitudes, or differences of longitudes, within -pi .. pi."""
+    """Return the same longitudes, or differences of longitudes, within -pi .. pi."""
     return np.asarray((np.asarray(longitude) + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def moved(latitude: float, longitude: float, north: Array, east: Array) -> tuple[Array, Array]:
-    """Latitudes and longitudes north and east [m] (N,) of a point.
+    """Return the latitudes and longitudes north and east [m] (N,) of a point.
 
     Along the meridian and the parallel of the middle latitude: right to a tenth of a
     millimetre within a kilometre, up to 80 degrees north or south.
@@ -32,7 +32,7 @@ def moved(latitude: float, longitude: float, north: Array, east: Array) -> tuple
 
 
 def offset(latitude: float, longitude: float, latitudes: Array, longitudes: Array) -> tuple[Array, Array]:
-    """How far north and east [m] of a point others (N,) are; the inverse of `moved`."""
+    """Return how far north and east [m] of a point others (N,) are; the inverse of `moved`."""
     along_meridian, across = _radii((latitude + latitudes) / 2.0)
     east = across * np.cos((latitude + latitudes) / 2.0) * wrapped(longitudes - longitude)
     return along_meridian * (latitudes - latitude), east

@@ -11,7 +11,7 @@ from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, WheelModel, Wh
 
 
 def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolerance: float = 1e-12) -> Array:
-    """Entry angle [rad], in the broadcast shape, at which the soil carries the load [N].
+    """Return the entry angle [rad], in the broadcast shape, at which the soil carries the load [N].
 
     Newton on logarithms, where the curve is nearly straight, inside a bracket that
     bisection shrinks whenever Newton leaves it; where it leads beyond MAX_ENTRY_ANGLE, that

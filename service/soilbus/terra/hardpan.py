@@ -21,12 +21,12 @@ those of the soil alone, with FEWER nodes less."""
 
 
 def reaching(state: WheelState, model: WheelModel) -> NDArray[np.bool_]:
-    """Which wheels (N,) reach the pan with the angle of greatest stress."""
+    """Return which wheels (N,) reach the pan with the angle of greatest stress."""
     return np.asarray(_start(state, model) < 1.0)
 
 
 def pan_stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
-    """What the pan adds under wheels that reach it; cohesion is to be left out of the state."""
+    """Return what the pan adds under wheels that reach it; leave cohesion out of the state."""
     theta, slip, r, _, K_L, n, _, _, K, _ = state
     q, peak, start = model.quadrature._replace(exit=model.leave(theta, slip)), model.peak(slip), _start(state, model)
     if skid:
@@ -49,7 +49,7 @@ def pan_stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
 
 
 def by_pan(at: Stress, state: WheelState, model: WheelModel) -> tuple[Array, Array]:
-    """Derivatives (3, N) by stiffness and by depth of what the pan adds to the integrals."""
+    """Return the derivatives (3, N) by stiffness and by depth of what the pan adds to the integrals."""
     scaled, sill = state.K_L * at.weight, model.pan_depth**state.n
     stiffer = scaled * (np.exp(state.n * at.log_z) - sill)
     deeper = -model.pan_stiffness * state.n * sill / model.pan_depth * scaled

@@ -53,14 +53,14 @@ class Rim(NamedTuple):
 
 @cache
 def gauss(nodes: int, power: int) -> tuple[Array, Array]:
-    """Gauss points on 0..1 clustered towards 0 by a power, and their weights; columns."""
+    """Return the Gauss points on 0..1 clustered towards 0 by a power, and their weights; columns."""
     u, w = np.polynomial.legendre.leggauss(nodes)
     u, w = (u[:, None] + 1.0) / 2.0, w[:, None] / 2.0
     return u**power, w * power * u ** (power - 1)
 
 
 def on_branches(x: Array, w: Array, peak: Any, leave: Any) -> tuple[Array, Array]:
-    """Nodes as shares of the entry angle and weights (2, M, ...) from x and weights on 0..1 (M, ...)."""
+    """Return the nodes as shares of the entry angle and weights (2, M, ...) from x and weights on 0..1 (M, ...)."""
     peak = peak + np.zeros_like(leave)
     return np.stack([1.0 - (1.0 - peak) * x, leave + (peak - leave) * x]), np.stack(
         [(1.0 - peak) * w, (peak - leave) * w]
@@ -69,12 +69,12 @@ def on_branches(x: Array, w: Array, peak: Any, leave: Any) -> tuple[Array, Array
 
 @cache
 def fixed_shares(q: Quadrature) -> tuple[Array, Array]:
-    """Shares and weights (2, M, 1) that serve every sample alike."""
+    """Return the shares and weights (2, M, 1) that serve every sample alike."""
     return on_branches(*gauss(q.nodes, q.power), q.peak, q.exit)
 
 
 def split_nodes(split: Array, q: Quadrature, start: Any = 0.0) -> tuple[Array, Array]:
-    """Nodes x and weights from a start to 1, (M + 2, N) for each of the panels before and after a place (N,)."""
+    """Return the nodes x and weights from a start to 1, (M + 2, N) for each panel before and after a place (N,)."""
     x, xw = gauss(q.nodes + 2, 3)  # shear is steep where it changes sign
     u, w = gauss(q.nodes + 2, 2)  # the branch may start just before the split
     before, after = split - start, 1.0 - split
@@ -82,7 +82,7 @@ def split_nodes(split: Array, q: Quadrature, start: Any = 0.0) -> tuple[Array, A
 
 
 def place_of_turn(theta: Array, slip: Array, peak: Any, q: Quadrature) -> Array:
-    """Where on 0..1 (N,) the shear of a skidding wheel changes sign; 1 if nowhere."""
+    """Return where on 0..1 (N,) the shear of a skidding wheel changes sign; 1 if nowhere."""
     turn = _turning_angle(theta, slip, q.exit)
     front = (theta - turn) / (theta * (1.0 - peak))
     rear = (turn - q.exit * theta) / (theta * (peak - q.exit))
@@ -91,7 +91,7 @@ def place_of_turn(theta: Array, slip: Array, peak: Any, q: Quadrature) -> Array:
 
 
 def place_of_depth(theta: Array, depth: Any, peak: Any) -> Array:
-    """Where on 0..1 (N,) the rim reaches a depth over radius; 1 if nowhere."""
+    """Return where on 0..1 (N,) the rim reaches a depth over radius; 1 if nowhere."""
     cos = np.cos(theta) + depth
     angle = np.arccos(np.minimum(cos, 1.0))
     return np.asarray(np.clip((theta - angle) / (theta * (1.0 - peak)), 0.0, 1.0))
@@ -120,7 +120,7 @@ def _turning_angle(entry: Array, slip: Array, exit_ratio: Any) -> Array:
 
 
 def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:
-    """Geometry for entry angles theta (N,) and shares (2, M, N); r_K is radius over K."""
+    """Return the geometry for entry angles theta (N,) and shares (2, M, N); r_K is radius over K."""
     angle = theta * share
     sin = np.sin(angle)
     cos = np.sqrt(1.0 - sin * sin)  # no contact reaches a right angle
@@ -138,7 +138,7 @@ def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:
 
 
 def rim_of_fixed_shares(theta: Array, q: Quadrature, r_K: Any, one_off: bool = False) -> Rim:
-    """As rim_at() for shares common to all samples: series in the entry angle, one matrix product each.
+    """Return `rim_at` for shares common to all samples, by series in the entry angle.
 
     Several times faster than sines of every angle, and free of cancellation near the entry.
     one_off: no other call will have these shares, so that nothing of them is kept.

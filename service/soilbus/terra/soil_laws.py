@@ -27,7 +27,7 @@ ShearLaw = Callable[[Any], tuple[Any, Any]]
 
 
 def normal_stress(K_L: Any, n: Any, sinkage: Any) -> Any:
-    """Bekker's pressure [Pa] at a sinkage [m] (eq. 3).
+    """Return Bekker's pressure [Pa] at a sinkage [m] (eq. 3).
 
     K_L [N/m^(n+2)] is the lumped modulus k_c/b + k_phi (eq. 35); negative sinkage, that
     is above the ground, carries nothing.
@@ -36,12 +36,12 @@ def normal_stress(K_L: Any, n: Any, sinkage: Any) -> Any:
 
 
 def lumped_modulus(k_c: Any, k_phi: Any, width: Any) -> Any:
-    """K_L = k_c/b + k_phi [N/m^(n+2)] of a tyre of width b [m] (eq. 35)."""
+    """Return K_L = k_c/b + k_phi [N/m^(n+2)] of a tyre of width b [m] (eq. 35)."""
     return k_c / width + k_phi
 
 
 def shear_displacement(entry_angle: Any, angle: Any, slip: Any, radius: Any) -> Any:
-    """Soil displacement j [m] along the rim since it was entered (eq. 16).
+    """Return the soil displacement j [m] along the rim since it was entered (eq. 16).
 
     Angles in rad from the vertical; slip = 1 - V/(r omega).  With negative slip (skid)
     the displacement first grows, then turns back and may change sign.
@@ -50,7 +50,7 @@ def shear_displacement(entry_angle: Any, angle: Any, slip: Any, radius: Any) -> 
 
 
 def exponential_shear(ratio: Any) -> tuple[Any, Any]:
-    """Mobilised share of shear strength for j/K, and its derivative (eq. 11).
+    """Return the mobilised share of shear strength for j/K, and its derivative (eq. 11).
 
     Janosi & Hanamoto 1961; odd in j/K, so that skid brakes.
     """
@@ -59,7 +59,7 @@ def exponential_shear(ratio: Any) -> tuple[Any, Any]:
 
 
 def rational_shear(ratio: Any) -> tuple[Any, Any]:
-    """The paper's substitute x/(1+x) for eq. 11, and its derivative (eq. 12).
+    """Return the paper's substitute x/(1+x) for eq. 11, and its derivative (eq. 12).
 
     Not a good approximation of the exponential law (shared/paper/notes.md); it is here
     to reproduce the paper.

@@ -57,7 +57,7 @@ UNKNOWN = "unknown"
 
 
 def soil_named(name: str) -> Soil:
-    """The soil of that name.
+    """Return the soil of that name.
 
     Raises
     ------

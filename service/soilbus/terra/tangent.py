@@ -24,7 +24,7 @@ _SHAPES = {
 
 
 def forces_along(state: WheelState, model: WheelModel) -> tuple[Dual, Dual, Dual]:
-    """Load [N], drawbar pull [N] and torque [N m], with derivatives by what fields of the state and the model carry.
+    """Return load [N], drawbar pull [N] and torque [N m] with the derivatives that state and model carry.
 
     ValueError where a field carries derivatives that none by the forces are known for.
     """

@@ -89,7 +89,7 @@ _OF_RATIONAL = tuple((-1.0) ** (k + 1) / (k + 1) for k in range(1, SERIES_TERMS 
 
 
 def mean_exponential_shear(u: Any) -> tuple[Array, Array]:
-    """Mean of the exponential law over a contact along which j/K grows from 0 to u, and its derivative by u.
+    """Return the mean of the exponential law over a contact with j/K from 0 to u, and its derivative by u.
 
     Odd in u, so that skid brakes.
 
@@ -106,7 +106,7 @@ def mean_exponential_shear(u: Any) -> tuple[Array, Array]:
 
 
 def mean_rational_shear(u: Any) -> tuple[Array, Array]:
-    """As mean_exponential_shear(), of the rational law.
+    """Return the mean of the rational law, as mean_exponential_shear().
 
     Examples
     --------
@@ -121,7 +121,7 @@ def mean_rational_shear(u: Any) -> tuple[Array, Array]:
 
 
 def modulated_shear(u: Any, rollers: int, law: str) -> tuple[Array, Array]:
-    """What the periods of the pressure add to the mean of a shear law, h(u), and its derivative by u; odd in u.
+    """Return what a periodic pressure adds to the mean of a shear law, h(u), and its derivative; odd in u.
 
     Examples
     --------
@@ -277,7 +277,7 @@ def _forces(columns: Iterator[tuple[Any, Any, Any]], radius: Any, n_samples: int
 
 
 def track_forces(state: WheelState, model: WheelModel) -> Array:
-    """Load W [N], drawbar pull DP [N] and sprocket torque T [N m] of tracks (3, N).
+    """Return the load W [N], drawbar pull DP [N] and sprocket torque T [N m] of tracks (3, N).
 
     Parameters
     ----------
@@ -290,19 +290,19 @@ def track_forces(state: WheelState, model: WheelModel) -> Array:
 
 
 def track_forces_and_jacobian(state: WheelState, model: WheelModel, shape: Sequence[str] = ()) -> Array:
-    """Forces and their derivatives by wheel.INPUTS and some of wheel.SHAPE or the length (3 + 21 + 3 D, N)."""
+    """Return the forces and their derivatives by wheel.INPUTS and some of SHAPE or the length (3 + 21 + 3 D, N)."""
     n_columns, n = 8 + len(shape), len(state.entry_angle)
     found = _forces(_columns(state, model, shape), state.radius, n, n_columns)
     return np.concatenate([found[:, 0], found[:, 1:].reshape(3 * n_columns - 3, n)])
 
 
 def track_forces_and_slopes(state: WheelState, model: WheelModel) -> Array:
-    """Forces and their derivatives by angle and slip (3 + 6, N)."""
+    """Return the forces and their derivatives by angle and slip (3 + 6, N)."""
     n = len(state.entry_angle)
     found = _forces(_columns(state, model, ()), state.radius, n, 3)
     return np.concatenate([found[:, 0], found[:, 1:].reshape(6, n)])
 
 
 def track_load_and_slope(state: WheelState, model: WheelModel) -> Array:
-    """Load and its derivative by the angle (2, N)."""
+    """Return the load and its derivative by the angle (2, N)."""
     return np.asarray(_forces(_columns(state, model, ()), state.radius, len(state.entry_angle), 2)[0])

@@ -33,12 +33,12 @@ class Chassis:
 
     @property
     def in_reverse(self) -> Chassis:
-        """For forces and slopes as a drive forward has them (`window.forward`): backward they act the other way."""
+        """Chassis for a reversed drive with forces and slopes turned forward (`window.forward`)."""
         return replace(self, cg_height=-self.cg_height, hitch_height=-self.hitch_height)
 
 
 def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
-    """1 - V/(r omega) (eq. 13 of Xi et al. 2024); nan where the wheel does not turn forward.
+    """Return the slip 1 - V/(r omega) (eq. 13 of Xi et al. 2024); nan where the wheel does not turn forward.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
 
 
 def pull_required(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> Any:
-    """Drawbar pull [N] that all wheels together must give: draft + m (g sin(pitch) + dv/dt).
+    """Return the drawbar pull [N] that all wheels together must give: draft + m (g sin(pitch) + dv/dt).
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def pull_required(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -
 
 
 def axle_loads(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> tuple[Any, Any]:
-    """Load [N] on the front and on the rear axle, from moments about the rear contact.
+    """Return the load [N] on the front and on the rear axle, from moments about the rear contact.
 
     An axle between them counts on both, by how near it is: a load W at x ahead of the rear axle is W x / wheelbase on
     the front axle and the rest on the rear one (`wheel_shares`).
@@ -92,7 +92,7 @@ def axle_loads(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> t
 
 
 def wheel_shares(ahead: Any) -> Any:
-    """Shares (W, 2) of the loads of `axle_loads` that each wheel carries, left and right alike.
+    """Return the shares (W, 2) of the loads of `axle_loads` that each wheel carries, left and right alike.
 
     With more than two axles these loads are statically indeterminate.  A rigid frame on equally stiff wheels makes them
     linear along the wheelbase: of all loads in balance those with the least sum of squares.
@@ -112,7 +112,7 @@ def wheel_shares(ahead: Any) -> Any:
 
 
 def wheel_loads(chassis: Chassis, ahead: Any, draft: Any, pitch: Any, acceleration: Any) -> Any:
-    """Load [N] (W, ...) on each wheel, `ahead` as in `wheel_shares`, left and right alike."""
+    """Return the load [N] (W, ...) on each wheel, `ahead` as in `wheel_shares`, left and right alike."""
     front, rear = axle_loads(chassis, draft, pitch, acceleration)
     of_front, of_rear = wheel_shares(ahead).T
     return np.multiply.outer(of_front, front) + np.multiply.outer(of_rear, rear)

@@ -86,18 +86,18 @@ class Soil(NamedTuple):
     K: float
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> float:
-        """Pressure [Pa] that carries a plate of width b_ref [m] at the depth z_ref [m] (eq. 3)."""
+        """Return the pressure [Pa] that carries a plate of width b_ref [m] at the depth z_ref [m] (eq. 3)."""
         return float(lumped_modulus(self.k_c, self.k_phi, b_ref) * z_ref**self.n)
 
 
 def state_on(soil: Soil, entry_angle: Any, slip: Any, radius: Any, width: Any, length: Any = 0.0) -> WheelState:
-    """The state of a wheel (radius, width [m]), or of a track with a contact length [m], on a soil."""
+    """Return the state of a wheel (radius, width [m]), or of a track with a contact length [m], on a soil."""
     K_L = lumped_modulus(soil.k_c, soil.k_phi, width)
     return WheelState(entry_angle, slip, radius, width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K, length)
 
 
 def wheel_forces(state: WheelState, model: WheelModel) -> Array:
-    """Load W [N], drawbar pull DP [N] and torque T [N m] of a wheel: eqs. 20-22 of Xi et al. 2024.
+    """Return load W [N], drawbar pull DP [N] and torque T [N m] of a wheel (eqs. 20-22 of Xi et al. 2024).
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def wheel_forces(state: WheelState, model: WheelModel) -> Array:
 def wheel_forces_and_derivatives(
     state: WheelState, model: WheelModel, shape: Sequence[str] = ()
 ) -> tuple[Array, Array]:
-    """Forces (3, ...) and their exact derivatives (3, 7 + D, ...) by INPUTS and some of SHAPE, radius and width held.
+    """Return forces (3, ...) and exact derivatives (3, 7 + D, ...) by INPUTS and some of SHAPE.
 
     Rows as FORCES, columns as INPUTS and then as asked for, among which may be the `length` of a track; units are those
     of force per unit of input.
@@ -139,13 +139,13 @@ def wheel_forces_and_derivatives(
 
 
 def wheel_forces_and_slopes(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
-    """Forces (3, ...) and their exact derivatives (3, 2, ...) by entry angle and slip; cheaper than by all inputs."""
+    """Return forces (3, ...) and their exact derivatives (3, 2, ...) by entry angle and slip."""
     both = in_chunks(_forces_and_slopes, track_forces_and_slopes, 9, state, model)
     return both[:3], both[3:].reshape(3, 2, *both.shape[1:])
 
 
 def sinkage(entry_angle: Any, radius: Any) -> Any:
-    """Sinkage [m] of a wheel with this entry angle [rad]: r (1 - cos theta_1) (eq. 1).
+    """Return the sinkage [m] of a wheel with this entry angle [rad]: r (1 - cos theta_1) (eq. 1).
 
     Examples
     --------
@@ -156,12 +156,12 @@ def sinkage(entry_angle: Any, radius: Any) -> Any:
 
 
 def carried_and_slope(state: WheelState, model: WheelModel) -> Array:
-    """Load and its derivative by the entry angle (2, ...)."""
+    """Return the load and its derivative by the entry angle (2, ...)."""
     return in_chunks(_load_and_slope, track_load_and_slope, 2, state, model)
 
 
 def in_chunks(integrate: OnRim, of_track: OnTrack, n_rows: int, state: WheelState, model: WheelModel) -> Array:
-    """(n_rows, ...) of an integrator of stresses and of the closed form of tracks; both get rows (N,) or floats."""
+    """Return (n_rows, ...) of an integrator, or of the closed form of tracks, chunk by chunk; rows (N,) or floats."""
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
     rows = WheelState(*[

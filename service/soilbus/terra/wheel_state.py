@@ -25,7 +25,7 @@ PEAK = 0.05, 0.8
 
 @dataclass(frozen=True, slots=True)
 class WheelModel:
-    """The choices that make a wheel-soil model.
+    """Choices that make a wheel-soil model.
 
     The angle of greatest stress is peak_c1 + peak_c2 s (1 + peak_bend) / (1 + peak_bend |s|)
     times the entry angle at the slip s (eq. 4 where it does not bend; at s = 1 always c1 + c2),
@@ -55,16 +55,16 @@ class WheelModel:
 
     @property
     def quadrature(self) -> Quadrature:
-        """Nodes for a wheel without slip."""
+        """Quadrature nodes for a wheel without slip."""
         return Quadrature(self.nodes, 3 if self.nodes >= EXACT_NODES else 2, self.peak_c1, self.exit_ratio)
 
     def peak(self, slip: Any) -> Any:
-        """Angle of greatest stress over entry angle, like the slips."""
+        """Return the angle of greatest stress over entry angle, like the slips."""
         share = self.peak_c1 + self.peak_c2 * slip * (1.0 + self.peak_bend) / (1.0 + self.peak_bend * np.abs(slip))
         return np.minimum(np.maximum(share, PEAK[0]), PEAK[1])
 
     def leave(self, entry_angle: Array, slip: Any) -> Any:
-        """Exit angle over entry angle (N,)."""
+        """Return the exit angle over entry angle (N,)."""
         ratio = self.exit_ratio + self.exit_slip * np.maximum(slip, 0.0)
         return np.maximum(ratio + self.exit_angle / entry_angle, -LONGEST)
 

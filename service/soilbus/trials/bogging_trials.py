@@ -42,7 +42,7 @@ MIN_DRIVE_TIME = 5.0
 
 
 class Task(NamedTuple):
-    """One drive: a kind of boggings.KINDS or firm_drives.FIRM_KINDS."""
+    """Task to simulate one drive: a kind of boggings.KINDS or firm_drives.FIRM_KINDS."""
 
     config: Config
     kind: str
@@ -51,7 +51,7 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WarningTrial:
-    """One drive: seconds watched and warnings begun before slip passed its limit.
+    """Result of one drive: seconds watched and warnings begun before slip passed its limit.
 
     lead [s] and distance [m] are of the last warning: nan where slip never passed, or within MIN_DRIVE_TIME; 0 without
     a warning. possible and possible_distance are those from the first perceptible loss of draft, or the first window.
@@ -72,7 +72,7 @@ class WarningTrial:
 
     @property
     def sudden(self) -> bool:
-        """Whether slip passed too soon after the first sign for any warning to be early enough."""
+        """Whether slip passed its limit too soon for any warning to be early enough."""
         speed = self.possible_distance / self.possible if 0.0 < self.possible < np.inf else 0.0
         return (
             self.possible < MIN_LEAD_TIME + REACTION_TIME
@@ -100,7 +100,7 @@ class WarningFigures:
 
 
 class Drive(NamedTuple):
-    """Start and end [s] of the time watched; the end is when slip passes its limit (`passed`), or that of the drive.
+    """Start and end [s] of the time watched, and whether slip passed its limit at the end.
 
     t [s] and distance driven [m] (N,); `felt` is the time [s] of the first perceptible loss of draft.
     """
@@ -113,7 +113,7 @@ class Drive(NamedTuple):
     felt: float
 
     def driven_since(self, since: float) -> float:
-        """Distance [m] driven from a time [s] until the end."""
+        """Return the distance [m] driven from a time [s] until the end."""
         at_end, before = np.interp((self.end, since), self.t, self.distance).tolist()
         return float(at_end - before)
 
@@ -169,7 +169,7 @@ def _warnings(recording: Recording, config: Config, end: float) -> tuple[list[fl
 
 
 def rated(kind: str, seen: Drive, begins: Sequence[float], holds: bool) -> WarningTrial:
-    """The trial's result from the times [s] at which warnings began, and whether the last one held until the end."""
+    """Return the trial's result from the times [s] at which warnings began, and whether the last held."""
     seconds = seen.end - seen.start
     if not seen.passed or seconds <= MIN_DRIVE_TIME:
         return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
@@ -182,7 +182,7 @@ def rated(kind: str, seen: Drive, begins: Sequence[float], holds: bool) -> Warni
 def warning_trials(
     config: Config, boggings: int, hours: float, seed: int, each: Each = map
 ) -> tuple[WarningFigures, ...]:
-    """Figures of drives into trouble, evenly of all kinds, and of hours on firm ground, half of them on hard drives.
+    """Return the figures of drives into trouble of all kinds, and of hours on firm ground.
 
     Raises SimulationError where the vehicle cannot be driven.
     """
@@ -200,7 +200,7 @@ def warning_trials(
 
 
 def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
-    """Figures of trials of one kind; those whose slip passed are boggings."""
+    """Return the figures of trials of one kind; those whose slip passed are boggings."""
     bogged = [t for t in trials if np.isfinite(t.lead)]
     asked = [t for t in bogged if not t.sudden]
     rest = [t for t in trials if t.kind in FIRM_KINDS]

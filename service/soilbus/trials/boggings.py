@@ -61,7 +61,7 @@ class BoggingDrive(NamedTuple):
 
 
 def bogging(config: Config, kind: str, rng: np.random.Generator) -> BoggingDrive:
-    """A drive of one of KINDS that is meant to end stuck; `rng` picks soils, lengths and drafts.
+    """Return a drive of one of KINDS that is meant to end stuck; `rng` picks soils, lengths and drafts.
 
     Raises SimulationError where the vehicle cannot be driven, ValueError for another kind.
     """
@@ -98,7 +98,7 @@ def _bogging(config: Config, kind: str, firm: str, side: float, rng: np.random.G
 
 
 def largest_draft(config: Config, soil: str, side: float = 0.0) -> float:
-    """Largest draft [N] on a soil of the table within the allowed slip, without a torque limit.
+    """Return the largest draft [N] on a soil of the table within the allowed slip, without a torque limit.
 
     side: share of each axle's load that a side slope moves to its left wheel.
     """
@@ -113,7 +113,7 @@ def largest_draft(config: Config, soil: str, side: float = 0.0) -> float:
 
 
 def side_shift(config: Config, soil: str, most: float) -> float:
-    """Greatest shift of load up to `most` with which a machine keeps KEPT_SHARE of its draft on the level.
+    """Return the greatest shift of load up to `most` with which a machine keeps KEPT_SHARE of its draft.
 
     An open differential gives both wheels no more torque than the lighter one holds: a tractor with one on a single
     driven axle keeps half of its draft where 15 % of the load are shifted, and none at 40 %.

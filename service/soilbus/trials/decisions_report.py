@@ -31,7 +31,7 @@ COVERAGE = (0.90, 0.98)
 
 
 def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]) -> str:
-    """All sections."""
+    """Return all sections of the report."""
     sections = [*_draft_section(drafts), "", *_call_section(calls), "", *_warning_section(warnings), "", SHARED]
     return "\n".join(sections) + "\n"
 
@@ -108,7 +108,7 @@ def _pooled(firm: Sequence[WarningFigures]) -> dict[str, _Pooled]:
 
 
 def poisson_interval(count: int) -> tuple[float, float]:
-    """95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
+    """Return the 95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
     least = float(gammaincinv(count, 0.025)) if count else 0.0
     return least, float(gammaincinv(count + 1, 0.975))
 
@@ -137,7 +137,7 @@ def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
 def as_json(
     drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]
 ) -> dict[str, object]:
-    """The figures as plain objects; null for what is not a number."""
+    """Return the figures as plain objects; null for what is not a number."""
     figures: dict[str, object] = known({
         "max_draft": [asdict(of_soil) for of_soil in drafts],
         "calls": asdict(calls),

@@ -40,7 +40,7 @@ SLIP_SHARES = np.linspace(0.02, 1.0, 50)
 
 
 class Task(NamedTuple):
-    """One drive."""
+    """Task to simulate one drive."""
 
     config: Config
     soil: str
@@ -59,7 +59,7 @@ class DraftTrial:
 
 @dataclass(frozen=True, slots=True)
 class DraftFigures:
-    """All drives on one soil: median of |relative error|, median error, share of 95 % intervals that hold the truth."""
+    """Figures of all drives on one soil: errors, and the share of 95 % intervals that hold the truth."""
 
     soil: str
     drives: int
@@ -71,7 +71,7 @@ class DraftFigures:
 
 
 def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> Iterator[DraftFigures]:
-    """Figures of `drives` drives on each of SOILS, then of all; SimulationError where the vehicle cannot drive."""
+    """Yield the figures of drives on each of SOILS, then of all; SimulationError where none can drive."""
     everything: list[DraftTrial] = []
     for name in SOILS:
         everything += (of_soil := list(each(trial, [Task(config, name, s) for s in seeds_of(seed, name, drives)])))
@@ -106,7 +106,7 @@ def true_largest_draft(
     soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf,
     drivetrain: Drivetrain | None = None, side_shift: float = 0.0,
 ) -> float:  # fmt: skip
-    """Largest draft [N] held steadily on level ground; nan where there is none.
+    """Return the largest draft [N] held steadily on level ground; nan where there is none.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def true_largest_draft(
 
 
 def figures(soil: str, trials: Sequence[DraftTrial]) -> DraftFigures:
-    """The figures of some trials; nan where all failed."""
+    """Return the figures of some trials; nan where all failed."""
     good = [t for t in trials if np.isfinite(t.predicted)]
     predicted, std, true = (np.array([getattr(t, of) for t in good]) for of in ("predicted", "std", "true"))
     if not good:

@@ -30,7 +30,7 @@ _R = TypeVar("_R")
 
 
 class Each(Protocol):
-    """Does a work for each task, here or in other processes: the built-in map, or that of `processes`."""
+    """Map of a work over tasks, here or in other processes."""
 
     def __call__(self, work: Callable[[_T], _R], tasks: Iterable[_T], /) -> Iterable[_R]:
         """The results in the order of the tasks."""
@@ -38,7 +38,7 @@ class Each(Protocol):
 
 @contextmanager
 def processes(count: int) -> Iterator[Each]:
-    """A map over `count` processes of one thread each; the built-in map for fewer than two."""
+    """Give a map over `count` processes of one thread each; the built-in map for fewer than two."""
     if count < 2:
         keep_freed_memory()
         yield map
@@ -50,7 +50,7 @@ def processes(count: int) -> Iterator[Each]:
 def first_drive(
     config: Config, draw: Callable[[], tuple[_T, Scenario]], seed: int, draws: int | None = None
 ) -> tuple[_T, Recording]:
-    """The first drawn scenario that the vehicle drives to its end, as what was drawn with it and the recording.
+    """Return the first drawn scenario that the vehicle drives to its end, with its draw and recording.
 
     Raises SimulationError, that of the last scenario, where the vehicle drives none of `draws` (MAX_DRAWS).
     """
@@ -64,7 +64,7 @@ def first_drive(
 
 
 def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
-    """A prior of the same spread whose medians are log-normal about this soil; held parameters are right."""
+    """Return a prior of the same spread with medians drawn about this soil; held parameters are right."""
     while True:
         median = np.asarray(soil) * np.exp(prior.log_std * rng.standard_normal(len(soil)))
         if median[_PHI] < MAX_PHI:
@@ -72,7 +72,7 @@ def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilP
 
 
 def drawn_soil(name: str, log_sd: float, rng: np.random.Generator) -> Soil:
-    """A soil whose parameters are log-normal about those of the table, with an angle that the model can have."""
+    """Return a soil drawn log-normally about those of the table, with an angle that the model can have."""
     while True:
         soil = Soil(*(np.asarray(soil_named(name)) * np.exp(log_sd * rng.standard_normal(len(PARAMETERS)))).tolist())
         if soil.phi < MAX_PHI:
@@ -80,12 +80,12 @@ def drawn_soil(name: str, log_sd: float, rng: np.random.Generator) -> Soil:
 
 
 def seeds_of(seed: int, name: str, count: int) -> list[int]:
-    """Seeds of `count` drives of a kind, which do not depend on those of other kinds."""
+    """Return seeds of `count` drives of a kind, which do not depend on those of other kinds."""
     return [int(s) for s in np.random.SeedSequence([seed, zlib.crc32(name.encode())]).generate_state(count)]
 
 
 def with_prior(config: Config, prior: SoilPrior) -> Config:
-    """The configuration with another prior of the soil."""
+    """Return the configuration with another prior of the soil."""
     std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
     pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
     soil = config.soil.model_copy(update={name: Prior(value=value, std=s) for name, value, s in pairs})

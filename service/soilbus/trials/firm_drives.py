@@ -45,7 +45,7 @@ _KNOT_PERIOD = 0.1
 
 
 def firm_ground(config: Config, kind: str, rng: np.random.Generator) -> Scenario:
-    """A drive of one of FIRM_KINDS, with a draft that the machine holds on the ground all along."""
+    """Return a drive of one of FIRM_KINDS, with a draft that the ground holds all along."""
     soil = str(rng.choice(_soft_soils(config) if kind == "soft" else FIRM_SOILS))
     side = side_shift(config, soil, HARSH_SIDE_SHIFT if kind == "harsh" else SIDE_SHIFT)
     return replace(_DRIVES[kind](config, soil, largest_draft(config, soil, side), rng), side_shift=Swing(-side, side))

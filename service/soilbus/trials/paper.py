@@ -42,7 +42,7 @@ MAX_N = 20.0
 
 
 class OperatingPoint(NamedTuple):
-    """What the method takes as known: sinkage [m], slip [-], radius and width [m], c [Pa], K [m]."""
+    """Known quantities of the method: sinkage [m], slip [-], radius and width [m], c [Pa], K [m]."""
 
     sinkage: float
     slip: float
@@ -53,7 +53,7 @@ class OperatingPoint(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """What it solves for: K_L [N/m^(n+2)], phi [rad], n [-]."""
+    """Unknowns of the method: K_L [N/m^(n+2)], phi [rad], n [-]."""
 
     K_L: float
     phi: float
@@ -75,7 +75,7 @@ class Forces(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """Rule "simpson" (eqs. 23-33) or "gauss" (the integrals themselves, to 1e-10), and shear law."""
+    """Rule of integration, "simpson" (eqs. 23-33) or "gauss" (to 1e-10), and shear law."""
 
     rule: str = "simpson"
     shear_law: str = "rational"
@@ -87,7 +87,7 @@ EXACT_EXPONENTIAL = Equations(rule="gauss", shear_law="exponential")
 
 
 class Solution(NamedTuple):
-    """Where an iteration ended, after how many steps, and whether the last one was small."""
+    """End of an iteration, its number of steps, and whether the last one was small."""
 
     end: Unknowns
     iterations: int
@@ -95,7 +95,7 @@ class Solution(NamedTuple):
 
     @property
     def soil(self) -> Unknowns | None:
-        """The end if the iteration converged to what a soil can have."""
+        """Soil at the end, if the iteration converged to values that a soil can have."""
         return self.end if self.converged and self.end.is_soil else None
 
 
@@ -138,11 +138,11 @@ class WheelEquations:
         self._unit = area, area, r * area
 
     def forces(self, x: Unknowns) -> Forces:
-        """W, DP and T (eqs. 20-22) of a soil."""
+        """Return W, DP and T (eqs. 20-22) of a soil."""
         return self.forces_and_columns(x)[0]
 
     def forces_and_columns(self, x: Unknowns) -> tuple[Forces, tuple[Three, Three, Three]]:
-        """Forces and the columns of their Jacobian (eq. 42): derivatives by K_L, by phi [1/rad], by n."""
+        """Return forces and the columns of their Jacobian (eq. 42): by K_L, by phi [1/rad], by n."""
         K_L, phi, n = x
         b, a, w, d, t, b_n, a_n, w_n, d_n, t_n = (self._rows @ self._z**n).tolist()
         (W, DP, T), (W_c, DP_c, T_c), tan = self._unit, self._of_c, math.tan(phi)
@@ -155,11 +155,11 @@ class WheelEquations:
         return forces, (by_K_L, by_phi, by_n)
 
     def jacobian(self, x: Unknowns) -> Array:
-        """Jacobian (3, 3) of W, DP and T by K_L, phi [rad] and n (eq. 42)."""
+        """Return the Jacobian (3, 3) of W, DP and T by K_L, phi [rad] and n (eq. 42)."""
         return np.array(self.forces_and_columns(x)[1]).T
 
     def newton(self, measured: Forces, start: Unknowns, most: int = MAX_ITERATIONS) -> Solution:
-        """The paper's iteration: Newton's method on all three unknowns (eq. 41), neither damped nor bounded.
+        """Solve by the paper's iteration: Newton's method on all three unknowns (eq. 41), undamped.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class WheelEquations:
         return Solution(x, most, False)
 
     def solve(self, measured: Forces, n: float) -> Solution:
-        """Ours for the same equations: Newton's method on 1/(n + 3/2) alone.
+        """Solve the same equations by Newton's method on 1/(n + 3/2) alone.
 
         Parameters
         ----------
@@ -220,7 +220,7 @@ class WheelEquations:
         return Solution(Unknowns(K_L, math.atan2(s, K_L), n), done, converged)
 
     def all_solutions(self, measured: Forces) -> list[Unknowns]:
-        """Every soil with n up to 3 that solves the equations, from no particular start.
+        """Return every soil with n up to 3 that solves the equations, from no particular start.
 
         Notes
         -----
@@ -241,14 +241,14 @@ class WheelEquations:
 
 
 def entry_angle(point: OperatingPoint) -> float:
-    """Entry angle [rad] of the sinkage (eq. 1); ValueError for a sinkage that is not between 0 and the radius."""
+    """Return the entry angle [rad] of the sinkage (eq. 1); ValueError for one that is not from 0 to the radius."""
     if not 0.0 < point.sinkage < point.radius:
         raise ValueError(f"a sinkage of {point.sinkage:g} m is not between 0 and the radius {point.radius:g} m")
     return math.acos(1.0 - point.sinkage / point.radius)
 
 
 def moduli_from_two_widths(K_L1: float, b1: float, K_L2: float, b2: float) -> tuple[float, float]:
-    """k_c [N/m^(n+1)] and k_phi [N/m^(n+2)] from K_L at two tyre widths [m] (eqs. 38-39, from 36 and 37)."""
+    """Return k_c [N/m^(n+1)] and k_phi [N/m^(n+2)] from K_L at two tyre widths [m] (eqs. 38-39)."""
     return (K_L1 - K_L2) * b1 * b2 / (b2 - b1), (K_L2 * b2 - K_L1 * b1) / (b2 - b1)
 
 

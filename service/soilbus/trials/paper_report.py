@@ -42,7 +42,7 @@ REPEATS = 20
 
 
 def paper_report(sinkage: float) -> str:
-    """The whole output for a sinkage [m] of the simulated wheels."""
+    """Return the whole output for a sinkage [m] of the simulated wheels."""
     parts = [
         _title("Xi et al. 2024 (World Electr. Veh. J. 15:217), reproduced"),
         _text(
@@ -72,7 +72,7 @@ def _item(text: str) -> str:
 
 
 def what_holds(sinkage: float) -> list[str]:
-    """The findings, each with a verdict that follows from its figures."""
+    """Return the findings on the paper, each with a verdict that follows from its figures."""
     ends = [(run.trial.truth, _newton(run, sinkage)) for run in RUNS]
     errors = [max(errors_in_percent(end.soil, truth)) for truth, end in ends if end.soil is not None]
     steps = [end.iterations for _, end in ends if end.soil is not None]
@@ -180,7 +180,7 @@ def _cells(row: PaperRow) -> tuple[str, ...]:
 
 
 def paper_table(number: int, sinkage: float) -> PaperTable:
-    """A table of the paper with ours beside it.
+    """Return a table of the paper with ours beside it.
 
     Parameters
     ----------

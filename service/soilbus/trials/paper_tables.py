@@ -37,7 +37,7 @@ class Trial(NamedTuple):
         return Unknowns(lumped_modulus(self.soil.k_c, self.soil.k_phi, self.width), self.soil.phi, self.soil.n)
 
     def at(self, sinkage: float, slip: float = SLIP) -> OperatingPoint:
-        """The wheel at a sinkage [m] and a slip."""
+        """Return the wheel at a sinkage [m] and a slip."""
         return OperatingPoint(sinkage, slip, self.radius, self.width, self.soil.c, self.soil.K)
 
 
@@ -75,17 +75,17 @@ START_ERRORS = {3: 20, 4: 50, 6: 20, 7: 50}
 
 
 def from_print(values: tuple[float, float, float]) -> Unknowns:
-    """SI values of a printed phi [deg], K_L [kN/m^(n+2)] and n."""
+    """Return SI values of a printed phi [deg], K_L [kN/m^(n+2)] and n."""
     phi, K_L, n = values
     return Unknowns(1e3 * K_L, math.radians(phi), n)
 
 
 def as_print(x: Unknowns) -> tuple[float, float, float]:
-    """phi [deg], K_L [kN/m^(n+2)] and n, in the order of the paper's tables."""
+    """Return phi [deg], K_L [kN/m^(n+2)] and n, in the order of the paper's tables."""
     return math.degrees(x.phi), 1e-3 * x.K_L, x.n
 
 
 def errors_in_percent(x: Unknowns, truth: Unknowns) -> tuple[float, float, float]:
-    """Relative errors of phi, K_L and n, in the order of the paper's tables."""
+    """Return the relative errors of phi, K_L and n, in the order of the paper's tables."""
     phi, K_L, n = (100.0 * abs(a / b - 1.0) for a, b in zip(as_print(x), as_print(truth), strict=True))
     return phi, K_L, n

@@ -50,14 +50,14 @@ BINS = 10
 
 
 class Task(NamedTuple):
-    """One drive."""
+    """Task to simulate one drive."""
 
     config: Config
     seed: int
 
 
 class Ground(NamedTuple):
-    """What a drive finds: soil, torque limits (W,) [N m] (nan: none) and a sinkage limit [m]."""
+    """Ground of a drive: soil, torque limits (W,) [N m] (nan: none) and a sinkage limit [m]."""
 
     name: str
     soil: Soil
@@ -67,7 +67,7 @@ class Ground(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call: probability that the demand can be met (nan: none), state, limiting cause, and whether it truly can."""
+    """Verdict on one drive: probability, state, limiting cause, and whether the demand can truly be met."""
 
     soil: str
     probability: float
@@ -78,7 +78,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Calls with a probability of low to high: count, mean, share that came true, and its 95 % interval."""
+    """Verdicts with a probability of low to high: count, mean, share that came true, and its 95 % interval."""
 
     low: float
     high: float
@@ -91,7 +91,7 @@ class Bin:
 
 @dataclass(frozen=True, slots=True)
 class Reliability:
-    """All calls.
+    """Figures of all verdicts.
 
     brier is the mean square of probability less outcome, brier_expected and brier_std its mean and sd if calls of p
     come true with frequency p; excess is outcomes less the sum of the probabilities, over its sd; wrong_go counts
@@ -111,7 +111,7 @@ class Reliability:
 
 
 def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> Reliability:
-    """Figures of `drives` simulated calls; SimulationError where the vehicle cannot be driven."""
+    """Return the figures of `drives` simulated verdicts; SimulationError where the vehicle cannot drive."""
     return reliability(list(each(trial, [Task(config, s) for s in seeds_of(seed, "verdicts", drives)])))
 
 
@@ -187,7 +187,7 @@ def _ground(config: Config, rng: np.random.Generator) -> Ground:
 
 
 def reliability(calls: Sequence[Call]) -> Reliability:
-    """The figures of some calls; nan where there is none."""
+    """Return the figures of some verdicts; nan where there is none."""
     made = [c for c in calls if math.isfinite(c.probability)]
     p, true = np.array([c.probability for c in made]), np.array([c.true for c in made], float)
     go = np.array([c.state is State.GO for c in made], bool)
@@ -213,7 +213,7 @@ def _bin(i: int, p: Array, true: Array) -> Bin:
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:
-    """95 % interval of a binomial frequency (Wilson 1927); 0 to 1 for no trials."""
+    """Return the 95 % interval of a binomial frequency (Wilson 1927); 0 to 1 for no trials."""
     if n == 0:
         return 0.0, 1.0
     interval = binomtest(hits, n).proportion_ci(0.95, method="wilson")

@@ -25,7 +25,7 @@ from soilbus.terra.wheel import Soil
 
 
 def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
-    """The samples of those channels that the configured rig has, in bins from 0 s on."""
+    """Return the samples of those channels that the configured rig has, in bins from 0 s on."""
     rig = rig_of(config)
     bins = Bins(rig, config.estimator.bin, 0.0)
     bins.add({name: (c.t, c.value) for name in rig.channels if (c := channels.get(name)) is not None})
@@ -35,18 +35,18 @@ def bins_of(config: Config, channels: Mapping[str, Column]) -> Bins:
 def observed(
     config: Config, channels: Mapping[str, Column], duration: float, options: EstimatorOptions = ESTIMATOR
 ) -> ObservationModel:
-    """The first `duration` [s] of the channels as one window to be fitted, without effects."""
+    """Return the first `duration` [s] of the channels as one window to be fitted, without effects."""
     window = bins_of(config, channels).window(0.0, duration)
     return ObservationModel(window, rig_of(config, options), model_of(config), config.estimator.min_speed)
 
 
 def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:
-    """Limits (W,) [N m] as the service has them where none is reported: each wheel's share of its motor's."""
+    """Return the limits (W,) [N m] that the service takes where none is reported."""
     return ReportedLimits(motors_of(config, rig)).at(0.0)
 
 
 def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np.float64], fresh: bool) -> WindowTask:
-    """The task of a window that ends at `end` [s], without missing inputs.
+    """Return the task of a window that ends at `end` [s], without missing inputs.
 
     torque_limit (W,) [N m] is nan where it is unknown; `fresh` carries nothing over from the window before.
     """
@@ -62,7 +62,7 @@ def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np
 
 
 def first_window(config: Config, recording: Recording, torque_limit: NDArray[np.float64]) -> WindowTask:
-    """The task of a recording's first window, with nothing carried over from before."""
+    """Return the task of a recording's first window, with nothing carried over from before."""
     window = bins_of(config, recording.channels).window(0.0, config.estimator.window)
     return task_of(
         completed(forward(window), rig_of(config)), config.estimator.window, config, torque_limit, fresh=True
@@ -70,7 +70,7 @@ def first_window(config: Config, recording: Recording, torque_limit: NDArray[np.
 
 
 def fit_from_soil(problem: ObservationModel, prior: SoilPrior, start: Soil) -> Fit | None:
-    """The fit of a window from one soil: first that alone with the latents as measured, then all together.
+    """Return the fit of a window from one soil: the soil alone first, then all together.
 
     Returns
     -------

@@ -18,7 +18,7 @@ _FORGOTTEN = 1e-15  # share of what was, that a low pass keeps
 
 
 def share_of_way(around: Surroundings) -> Any:
-    """0 at the start of the record, 1 at its end: by distance where its length is known, by time otherwise."""
+    """Return the share of the way of a record, 0 to 1: by distance where its length is known, else by time."""
     if around.length > 0.0:
         return np.asarray(around.distance) / around.length
     if around.duration > 0.0:
@@ -27,7 +27,7 @@ def share_of_way(around: Surroundings) -> Any:
 
 
 def through_knots(share: Any, heights: Sequence[Any]) -> Any:
-    """The natural cubic spline through heights at equally spaced shares 0..1 of the way, level beyond.
+    """Return the natural cubic spline through heights at equally spaced shares 0..1 of the way, level beyond.
 
     Linear in the heights; twice as near to a smooth profile as straight lines between as many knots.
     """
@@ -35,7 +35,7 @@ def through_knots(share: Any, heights: Sequence[Any]) -> Any:
 
 
 def mean_height(heights: Sequence[Any]) -> Any:
-    """The mean over the whole way of the curve through_knots(); linear in the heights."""
+    """Return the mean over the whole way of the curve through_knots(); linear in the heights."""
     return weighed_sum(_mean_splines(len(heights)), heights)
 
 
@@ -49,12 +49,12 @@ def _mean_splines(knots: int) -> Array:
 
 
 def curve_of(name: str, unit: str, knots: range, intervals: int, std: float, most: float) -> tuple[Parameter, ...]:
-    """The heights of a curve at these of its knots 0..intervals, each with this prior std, as parameters name_1 ..."""
+    """Return the heights of a curve at these of its knots, as parameters name_1, ..., each with this prior std."""
     return tuple(Parameter(f"{name}_{i}", unit, 0.0, std, -most, most, knot=Knot(name, i, intervals)) for i in knots)
 
 
 def splines(share: Any, knots: int) -> Array:
-    """The splines (knots, ...) that are one at one knot and zero at all others."""
+    """Return the splines (knots, ...) that are one at one knot and zero at all others."""
     shares = np.asarray(share, float)
     return _splines(shares.tobytes(), knots).reshape(knots, *shares.shape)
 
@@ -84,13 +84,13 @@ def _bending(knots: int) -> Array:
 
 
 def instants(values: Any) -> Any:
-    """One value for each instant (N,) of what all wheels share: (N,), (N, 1) or (N, W)."""
+    """Return one value for each instant (N,) of a quantity that all wheels share: (N,), (N, 1) or (N, W)."""
     array = values if isinstance(values, Dual) else np.asarray(values, float)
     return array[:, 0] if array.ndim == 2 else array
 
 
 def stretches(t: Array) -> tuple[NDArray[np.intp], ...]:
-    """Indices of times [s] (N,) in runs that go forward without a gap."""
+    """Return the indices of times [s] (N,) in runs that go forward without a gap."""
     return _stretches(np.asarray(t, float).tobytes())
 
 
@@ -106,7 +106,7 @@ def _stretches(times: bytes) -> tuple[NDArray[np.intp], ...]:
 
 
 def earlier(t: Array, delay: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Two instants of its run for each one (N,), and the share (N,) of the way from the first to the second at which
+    """Return two instants of its run for each one (N,), and the share (N,) of the way between them at which
     the moment so long [s] before it lies.
 
     Negative before a run's first instant: on the straight line through its first two.
@@ -122,7 +122,7 @@ def earlier(t: Array, delay: float) -> tuple[NDArray[np.intp], NDArray[np.intp],
 
 
 def through_low_pass(t: Array, values: Array, time_constant: float) -> Array:
-    """Values (N, W) at times (N,) [s] after a first-order lag [s], that has settled at the first one of each run.
+    """Return values (N, W) at times (N,) [s] after a first-order lag [s] that has settled before each run.
 
     Exact where they go in straight lines from one time to the next.
     """

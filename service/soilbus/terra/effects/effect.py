@@ -53,7 +53,7 @@ class Surroundings(NamedTuple):
 
 
 class Knot(NamedTuple):
-    """Which knot of which curve along the way: `number` of 0..intervals; knots that are no parameters are zero."""
+    """Knot of a curve along the way: `number` of 0..intervals; knots that are no parameters are zero."""
 
     curve: str
     number: int
@@ -98,13 +98,13 @@ class Late(NamedTuple):
 
     @property
     def total(self) -> str:
-        """Name of their sum, which data tell best: a low pass delays by its time constant, to the first order."""
+        """Name of their sum, which data tell best: a low pass delays by its time constant."""
         return self.delay.removesuffix("delay") + "total"
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One physical or sensor effect.
+    """Physical or sensor effect with its parameters.
 
     `physics` is the sentence a report prints, `source` where its equation comes from,
     `tells` the manoeuvre or sensor that shows it apart from others.  The first of the
@@ -147,12 +147,12 @@ class Effect:
         return {p.name: p.neutral for p in self.parameters}
 
     def own_in_each_record(self, parameter: Parameter) -> bool:
-        """Whether every record has its own value of one of the parameters."""
+        """Return whether every record has its own value of one of the parameters."""
         return (self.of_record and not parameter.of_vehicle) or parameter.of_record
 
 
 class Active(NamedTuple):
-    """An effect with values of all its parameters."""
+    """Effect with values of all its parameters."""
 
     effect: Effect
     values: Values
@@ -161,7 +161,7 @@ class Active(NamedTuple):
 def wheel_with(
     active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings
 ) -> tuple[WheelState, WheelModel]:
-    """State and model of wheels with these effects: its radius, and the entry angle before them, give the sinkage."""
+    """Return state and model of wheels with these effects."""
     for effect, values in active:
         if effect.wheel is not None:
             state, model = effect.wheel(state, model, around, values)
@@ -169,13 +169,13 @@ def wheel_with(
 
 
 def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> Array:
-    """Load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
+    """Return the load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
     state, model = wheel_with(active, state, model, around)
     return np.stack(list(reactions_with(active, wheel_forces(state, model), state, around)))
 
 
 def reactions_with(active: Sequence[Active], forces: Forces, state: WheelState, around: Surroundings) -> Forces:
-    """The same from the integrated forces of a state that already has these effects."""
+    """Return `forces_with` from the integrated forces of a state that already has these effects."""
     for effect, values in active:
         if effect.forces is not None:
             forces = effect.forces(forces, state, around, values)
@@ -183,7 +183,7 @@ def reactions_with(active: Sequence[Active], forces: Forces, state: WheelState, 
 
 
 def true_draft(active: Sequence[Active], reading: Any, around: Surroundings) -> Any:
-    """Draft [N] (N,) for which the load cell at the hitch, with the errors of these effects, gives the reading (N,)."""
+    """Return the draft [N] (N,) for which the load cell, with the errors of these effects, gives the reading (N,)."""
     errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
     draft = reading
     for _ in range(DRAFT_ROUNDS if errors else 0):

@@ -60,12 +60,12 @@ DRAFT_GAIN = Effect(
 
 
 def late_by(values: Values, late: Late) -> float:
-    """How late a channel is in all [s]: a first-order lag is, to the first order, a delay of its time constant."""
+    """Return the total delay [s] of a channel: its dead time plus the time constant of its lag."""
     return float(values[late.delay]) + float(values[late.time_constant])
 
 
 def lateness(active: Sequence[Active]) -> dict[str, float]:
-    """How late each quantity is in all by these effects [s]."""
+    """Return the total delay [s] of each quantity by these effects."""
     found: dict[str, float] = {}
     for effect, values in active:
         for quantity, late in effect.late.items():
@@ -74,7 +74,7 @@ def lateness(active: Sequence[Active]) -> dict[str, float]:
 
 
 def read_late(truth: Array, t: Array, values: Values, late: Late) -> Array:
-    """x(t - delay) through a low pass, of (N, W) at times t [s] (N,).
+    """Return values (N, W) at times t [s] (N,) late by a delay and through a low pass.
 
     On straight lines between instants, and on beyond the first one of a run.
     """

@@ -15,7 +15,7 @@ RADIUS = 0.56
 
 
 def for_wheel(effect: Effect, load: float, radius: float) -> Effect:
-    """The effect with parameters [N, N/s, N m, m, m/N] as a wheel of this load [N] and radius [m] lets expect them.
+    """Return the effect with priors scaled to a wheel of this load [N] and radius [m].
 
     Load cells are chosen by the load, lugs and the depth that a wheel feels grow with the
     radius, the drag of seals with circumference times arm.  Everything else of an effect is

@@ -38,7 +38,7 @@ class Slopes(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CompletedModel:
-    """A wheel-soil model with effects whose parameters are known, at a ground speed [m/s] that some depend on.
+    """Wheel-soil model with effects whose parameters are known, at a ground speed [m/s].
 
     Of the effects count those that act on wheels of any ground: not on sensors of load and
     draft, not on one wheel alone, and not those that describe the ground of one record.
@@ -50,18 +50,18 @@ class CompletedModel:
 
     @classmethod
     def of(cls, model: WheelModel, effects: Sequence[Active], ground_speed: float) -> CompletedModel:
-        """With those of the effects that count."""
+        """Return the model with those effects that act on steady forces."""
         kept = [a for a in effects if not (a.effect.of_record or a.effect.each_wheel or a.effect.late)]
         acting = [a for a in kept if a.effect.wheel or a.effect.forces or a.effect.torque]
         return cls(model, tuple(acting), ground_speed)
 
     @classmethod
     def over(cls, model: WheelModel | CompletedModel) -> CompletedModel:
-        """A wheel-soil model as one without effects; a completed one as it is."""
+        """Return a wheel-soil model as one without effects, and a completed one unchanged."""
         return model if isinstance(model, CompletedModel) else cls(model)
 
     def forces(self, state: WheelState, rear: Any, load: Array) -> Array:
-        """Load, drawbar pull and the motor's torque at the wheel (3, ...).
+        """Return the load, drawbar pull and the motor's torque at the wheel (3, ...).
 
         rear says which wheels are on the rear axle, load [N] what they carry.
         """
@@ -75,7 +75,7 @@ class CompletedModel:
         return forces
 
     def forces_and_slopes(self, state: WheelState, rear: Any, load: Array) -> tuple[Array, Slopes]:
-        """As `forces`, with derivatives: exact without effects, by differences with them."""
+        """Return `forces` with derivatives: exact without effects, by differences with them."""
         if not self.effects:
             forces, by = wheel_forces_and_slopes(state, self.model)
             return forces, Slopes(by[:, 0], by[:, 1], np.zeros_like(forces))
@@ -89,7 +89,7 @@ class CompletedModel:
         )
 
     def sinkage(self, angle: Array, wheel: Wheel) -> Array:
-        """Sinkage [m] at an entry angle [rad]: of the circle that effects make of the wheel."""
+        """Return the sinkage [m] at an entry angle [rad]: of the circle that effects make of the wheel."""
         if not self.effects:
             return np.asarray(sinkage(angle, wheel.radius))
         state = WheelState(angle, 0.0, wheel.radius, wheel.width, 1.0, 1.0, 1.0, 1.0, 1.0)  # on any soil
@@ -97,7 +97,7 @@ class CompletedModel:
         return np.asarray(sinkage(angle, now.radius))
 
     def angle_of_sinkage(self, depth: float, wheel: Wheel) -> Array:
-        """Entry angle [rad] at which a wheel has sunk so deep [m], a right angle at most."""
+        """Return the entry angle [rad] at which a wheel has sunk so deep [m], a right angle at most."""
         angle = np.arccos(1.0 - np.minimum(depth / wheel.radius, 1.0))
         for _ in range(ROUNDS if self.effects and depth > 0.0 else 0):
             circle = self.sinkage(angle, wheel) / sinkage(angle, 1.0)

@@ -46,7 +46,7 @@ MEASUREMENTS: tuple[Measurement, ...] = (
 
 
 def run_bench() -> dict[str, Any]:
-    """Measure everything.
+    """Measure every figure.
 
     Returns
     -------
@@ -86,14 +86,14 @@ def _figures() -> dict[str, Figure]:
 
 
 def as_results(figures: Mapping[str, Figure]) -> dict[str, Any]:
-    """Value by figure's name, beside "details" of each and the "machine"."""
+    """Return the value by figure's name, beside "details" of each and the "machine"."""
     details = {name: asdict(figure) | {"met": figure.met} for name, figure in figures.items()}
     machine = {"python": platform.python_version(), "numpy": np.__version__, "machine": platform.machine()}
     return {name: figure.value for name, figure in figures.items()} | {"details": details, "machine": machine}
 
 
 def bench_report(results: Mapping[str, Any]) -> str:
-    """What run_bench() measured as a table, each figure beside its target and its peer."""
+    """Return what run_bench() measured as a table, beside targets and peers."""
     figures = {
         name: Figure(**{k: v for k, v in detail.items() if k != "met"}) for name, detail in results["details"].items()
     }

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A value with its target, which is the least or (at_most) the greatest value that will do; None: no target.
+    """Value with its target, the least or (at_most) the greatest that will do; None: no target.
 
     peer and what are a few words for the table, more are lines below it, all the numbers behind it.
     """
@@ -46,12 +46,12 @@ class Figure:
 
 
 def wall_time(work: Callable[[], Any], repeats: int) -> float:
-    """Shortest wall time of several runs [s]: what else the machine does only adds."""
+    """Return the shortest wall time of several runs [s]: what else the machine does only adds."""
     return min(timeit.repeat(work, number=1, repeat=repeats))
 
 
 def in_turn(works: Sequence[Callable[[], Any]], rounds: int) -> NDArray[np.float64]:
-    """Least processor time [s] of each work (len(works),), all run once in each round.
+    """Return the least processor time [s] of each work (len(works),), all run once in each round.
 
     So a busy machine slows all of them alike.
     """

@@ -31,7 +31,7 @@ MAX_EXPONENT = 1.1
 
 
 def exponents() -> dict[str, Figure]:
-    """The exponents for wheels and for samples: of doubling to the largest size, where the fixed time hides least."""
+    """Return the exponents of the time for wheels and for samples, by doubling to the largest size."""
     windows = [window for wheels in WHEELS for window in problems(wheels)]
     iterations = []
     for problem, prior in windows:
@@ -66,7 +66,7 @@ def _fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
 
 
 def problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
-    """Windows of all lengths of the reference tractor with this number of wheels, half of them on each axle."""
+    """Yield windows of all lengths of the reference tractor with this number of wheels."""
     config = reference_configuration()
     config = config.model_copy(update={"wheel": config.wheel[:: len(config.wheel) // wheels]})
     channels = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1).channels

@@ -33,7 +33,7 @@ MAX_WINDOW_MS = 10.0
 
 
 def decode_speedup(log: Path) -> Figure:
-    """Mapped signals of every message, a 10 s window (500 frames) at a time, against cantools frame by frame."""
+    """Compare decoding of all mapped signals, 500 frames at a time, with cantools frame by frame."""
     config = reference_configuration()
     database = load_databases(config)
     wanted: dict[str, list[str]] = {}
@@ -67,7 +67,7 @@ def decode_speedup(log: Path) -> Figure:
 
 
 def replay_factors(log: Path, seconds: float) -> dict[str, Figure]:
-    """Replay of a log of `seconds` [s] with a hop of 1 s, beside reading it with python-can."""
+    """Compare the replay of a log of `seconds` [s] with reading it by python-can."""
     config = reference_configuration()
 
     def beside() -> None:
@@ -97,7 +97,7 @@ def replay_factors(log: Path, seconds: float) -> dict[str, Figure]:
 
 
 def window_times(log: Path) -> dict[str, Figure]:
-    """Least processor time [ms] of a window in several rounds: its estimate alone, and with intake and decision."""
+    """Return the least processor time [ms] of a window: its estimate alone, and with intake and decision."""
     config = reference_configuration()
     intake, estimate, decision = 1e3 * np.min([list(seconds_of_windows(log, config)) for _ in range(ROUNDS)], axis=0).T
     whole = intake + estimate + decision
@@ -119,7 +119,7 @@ def window_times(log: Path) -> dict[str, Figure]:
 
 
 def seconds_of_windows(log: Path, config: Config) -> Iterator[NDArray[np.float64]]:
-    """Processor seconds (3,) of intake, estimate and decision of each window of a log under a configuration."""
+    """Yield the processor seconds (3,) of intake, estimate and decision of each window of a log."""
     pipeline = Pipeline(config, load_databases(config))
     intake, estimator = pipeline.intake, pipeline.estimator
     due = -np.inf

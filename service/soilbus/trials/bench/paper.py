@@ -27,7 +27,7 @@ Problem = tuple[OperatingPoint, Forces, Unknowns]
 
 
 def paper_solve_speedup() -> Figure:
-    """The paper's three wheels from 20 % and 50 % off, rational shear and exact integrals, one solve at a time."""
+    """Compare our solution of the paper's three wheels with fsolve's, one solve at a time."""
     problems = paper_problems()
 
     def ours(problem: Problem) -> Unknowns:
@@ -53,7 +53,7 @@ def paper_solve_speedup() -> Figure:
 
 
 def paper_problems() -> list[Problem]:
-    """Operating point, forces and start of the paper's three wheels at 20 % and 50 % off."""
+    """Return operating point, forces and start of the paper's three wheels at 20 % and 50 % off."""
     problems = []
     for trial in TRIALS.values():
         point = trial.at(SINKAGE)
@@ -63,7 +63,7 @@ def paper_problems() -> list[Problem]:
 
 
 def balance(point: OperatingPoint, measured: Forces) -> Callable[[Any], list[float]]:
-    """Eqs. 20-22 less the measured forces, for fsolve: the paper's ten integrals, each by quad."""
+    """Return eqs. 20-22 less the measured forces, for fsolve: the paper's ten integrals, each by quad."""
     r, area = point.radius, point.radius * point.width
     c, K, advance = point.c, point.K, 1.0 - point.slip
     theta1 = entry_angle(point)

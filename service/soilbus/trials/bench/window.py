@@ -52,14 +52,14 @@ AT_REST = replace(ESTIMATOR, standing=HELD)
 
 
 class Window(NamedTuple):
-    """A window to fit, and what is known beforehand."""
+    """Window to fit, and what is known beforehand."""
 
     problem: ObservationModel
     prior: SoilPrior
 
 
 def window_solve_speedup() -> Figure:
-    """10 s, four wheels, five free parameters, cold; AssertionError where the two come to different ends."""
+    """Compare our solution of a window of four wheels with scipy's; AssertionError where the ends differ."""
     windows = [window_of(soil, *known) for known in EXACT_AND_ROUGH for soil in SOILS]
     apart, times = [], []
     for window in windows:
@@ -77,7 +77,7 @@ def window_solve_speedup() -> Figure:
 
 
 def distance(window: Window, ours: Fit | None, peer: Posterior) -> float:
-    """How far the peer's end is from ours, in our standard deviation of the parameter where that is most."""
+    """Return how far the peer's end is from ours, in sd of the worst parameter."""
     if ours is None or not ours.converged:
         raise AssertionError("our fit failed")
     free = window.prior.free
@@ -86,7 +86,7 @@ def distance(window: Window, ours: Fit | None, peer: Posterior) -> float:
 
 
 def by_finite_differences(problem: ObservationModel, prior: SoilPrior) -> Posterior:
-    """The most probable soil by scipy's least_squares, with the covariance of its last Jacobian.
+    """Return the most probable soil by scipy's least_squares, with the covariance of its last Jacobian.
 
     Notes
     -----
@@ -160,7 +160,7 @@ def _whitened(
 
 
 def window_of(name: str, exact: str, rough: str) -> Window:
-    """A simulated drive with slip swept from 0.05 to 0.4."""
+    """Return the window of a simulated drive with slip swept from 0.05 to 0.4."""
     soil = soil_named(name)
     median = 1.25 * getattr(soil, rough)
     config = reference_configuration([
