@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.local_cubics import Series, curve_of, variance_of_one
+from soilbus.estimation.local_cubics import Instants, Series, curve_of, kept_noise, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
@@ -50,26 +50,49 @@ def test_a_cubic_is_its_own_curve():
             assert computed == pytest.approx(true(now), abs=1e-5)
 
 
+def value_and_slope(noise, half, place):
+    """Value and slope of curves (M,) through rows of noise (M, K) at a place between samples."""
+    by_power = np.linalg.pinv(np.arange(-half, half + 1.0)[:, None] ** np.arange(4))
+    i, u = int(np.floor(place)), place - np.floor(place)
+    (a, b), (left, right), (bend, next_bend) = (
+        [noise[:, k - half : k + half + 1] @ w for k in (i, i + 1)]
+        for w in (by_power[0], by_power[1], 2.0 * by_power[2])
+    )
+
+    def between(start, end, left, right):
+        rise = end - start
+        return start + u * (left + u * (3 * rise - 2 * left - right + u * (left + right - 2 * rise)))
+
+    return between(a, b, left, right), between(left, right, bend, next_bend)
+
+
+def noise_of_instants(noise, half, n, phase, middle):
+    """What noise adds to values at instants by n samples about a place and the curve there."""
+    own = np.arange(n) + int(round(middle - (n - 1) / 2.0))
+    rest = np.mean([noise[:, k] - value_and_slope(noise, half, k)[0] for k in own], axis=0)
+    return rest + value_and_slope(noise, half, middle + phase)[0]
+
+
 @pytest.mark.parametrize("half", [2, 4, 9])
 @pytest.mark.parametrize(("n", "phase"), [(1, 0.25), (2, 0.0), (5, 0.5), (3, -0.75)])
 def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, n, phase):
     """The same sums over white noise, 20 000 times."""
-    rng = np.random.default_rng(4)
-    reach = half + n + 2
-    noise = rng.standard_normal((20_000, 2 * reach + n))
-    places = np.arange(-half, half + 1.0)
-    basis = places[:, None] ** np.arange(4)
-    value, slope = np.linalg.pinv(basis)[:2]
-    smooth, slopes = (
-        np.apply_along_axis(lambda row, w=w: np.convolve(row, w[::-1], "same"), 1, noise) for w in (value, slope)
-    )
-    middle = reach + (n - 1) / 2.0 + phase
-    i, u = int(middle), middle - int(middle)
-    left, right, rise = slopes[:, i], slopes[:, i + 1], smooth[:, i + 1] - smooth[:, i]
-    there = smooth[:, i] + u * (left + u * (3 * rise - 2 * left - right + u * (left + right - 2 * rise)))
-    own = slice(reach, reach + n)
-    computed = noise[:, own].mean(1) - smooth[:, own].mean(1) + there
+    noise = np.random.default_rng(4).standard_normal((20_000, 2 * half + 2 * n + 6))
+    computed = noise_of_instants(noise, half, n, phase, half + n + 2 + (n - 1) / 2.0)
     assert variance_of_one(half, n, round(phase * PHASE_PARTS)) == pytest.approx(computed.var(), rel=0.04)
+
+
+@pytest.mark.parametrize("half", [3, 9])
+@pytest.mark.parametrize(("n", "phase"), [(1, 0.25), (2, 0.0), (2, -0.5)])
+@pytest.mark.parametrize(("ahead", "lag"), [(0.4, 0.0), (-0.4, 0.0), (1.7, 0.0), (-9.0, 0.0), (3.0, 0.3)])
+def test_a_shift_along_a_curve_leaves_the_noise_of_instants_as_large_as_it_is(half, n, phase, ahead, lag):
+    """Else a sound channel seems late, as some shift leaves smaller residuals."""
+    noise, middle = np.random.default_rng(6).standard_normal((100_000, 60)), 30.0 + (n - 1) / 2.0
+    now = noise_of_instants(noise, half, n, phase, middle)
+    off = now - value_and_slope(noise, half, middle + phase)[0]
+    value, slope = value_and_slope(noise, half, middle + phase + ahead)
+    kept = kept_noise(half, Instants(n, phase, half), ahead, lag)
+    assert (kept * off + value + lag * slope).var() == pytest.approx(now.var(), rel=0.03)
 
 
 def store_of(shake: float, step: float = 0.02) -> Bins:

@@ -22,7 +22,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
-__all__ = ["STANDING", "StandingColumns", "slope", "standing_columns", "standing_std", "wheel_inertia"]
+__all__ = ["STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
 
 STANDING = (
     "relaxation_length", "wheel_inertia", "lateness.load", "lateness.ground_speed", "lateness.draft",
