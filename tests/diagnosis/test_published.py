@@ -24,8 +24,6 @@ from tests.lab.published_wheels import (
     strain,
 )
 
-TEMPERATURE = 6.0
-"""What falls of -2 log evidence are divided by where little is explained."""
 TESTED_PHI = math.radians(31.9)
 """Friction angle of the soil of Ding et al. 2011, from their shear tests."""
 
@@ -47,15 +45,11 @@ def ding(points):
 @pytest.mark.parametrize("errors", [1, 2])
 @pytest.mark.parametrize("wheel", ["smooth", "lugged"])
 def test_both_wheels_of_ding_dig_in_as_they_slip(ding, wheel, errors):
-    """Their own finding, from which n = n0 + n1 s comes, outlives errors twice as large as assumed.
-
-    Those leave a shift of the stress peak not far behind.
-    """
+    """Their own finding, from which n = n0 + n1 s comes, outlives errors twice as large as assumed."""
     found = ding[wheel, errors]
     first = found.additions[0]
     assert first.effect.name == "slip_sinkage"
-    others = max((fall for name, fall in first.falls.items() if name != "slip_sinkage"), default=0.0)
-    assert first.falls["slip_sinkage"] > (1.3 if errors == 1 else 1.0) * others
+    assert first.probability > 0.8
     assert found.completed.held_out_chi2 - 1.0 < 0.5 * (found.base.held_out_chi2 - 1.0)
     assert found.completed.parameters()["slip_sinkage"]["exponent"].value == pytest.approx(0.7, abs=0.3)
 
@@ -82,13 +76,16 @@ def test_the_smooth_wheels_soil_is_strained_by_the_lugged_wheel(points, ding, er
 
 
 @pytest.mark.parametrize("errors", [2.0, 3.0])
-def test_lugs_explain_the_lugged_wheel_better_than_another_shape_of_the_stress_but_not_by_much(points, errors):
-    """With errors that Ding's smooth wheel itself asks for the odds are below one to three; and only lugs leave the
-    soil nearer to what the smooth wheel had."""
+def test_lugs_and_another_shape_of_the_stress_predict_the_lugged_wheel_alike_but_only_lugs_leave_its_soil(
+    points, errors
+):
+    """With errors that Ding's smooth wheel itself asks for no row tells them apart.
+
+    Lugs alone leave the soil nearer to what the smooth wheel had.
+    """
     beside = lugs_beside_a_shifted_peak(errors, points)
     lugs, shifted, nothing = (beside[name] for name in ("lugs", "stress_peak_shift", "nothing"))
-    assert lugs.fall > TEMPERATURE
-    assert shifted.fall < lugs.fall < shifted.fall + 2.0 * TEMPERATURE
+    assert abs(lugs.fall - shifted.fall) < 12.0
     assert lugs.strain < 0.5 * nothing.strain
     assert shifted.strain > 0.8 * nothing.strain
 

@@ -85,8 +85,8 @@ def test_a_hidden_error_is_found_at_its_channel_wheel_and_region(channel, size, 
         if (place.channel, place.wheel) == (quantity, wheel) and place.region.startswith(f"{region} ")
     }
     assert len(thirds) >= 2
-    step = thirds[max(thirds)] - thirds[min(thirds)]  # the fit has spread it over all of the region
-    assert 0.5 < step / size < 1.2
+    step = thirds[max(thirds)] - thirds[min(thirds)]  # the fit has spread it over the region, relaxation and inertia
+    assert 0.4 < step / size < 1.2
 
 
 def test_significances_are_of_all_tests_together_and_the_clearest_comes_first():

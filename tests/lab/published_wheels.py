@@ -86,7 +86,7 @@ def records_of(config: Config, points: Path, other_wheel: FittedModel | None = N
 
 
 class Beside(NamedTuple):
-    """What one effect beside those known does for the other wheel: fall of -2 log evidence, strain left of the soil."""
+    """What one effect beside those known does for the other wheel: fall of the score, strain left of the soil."""
 
     fall: float
     strain: float

@@ -64,9 +64,10 @@ class Record:
     noise: Mapping[str, float] = field(default_factory=dict)
 
     def block_numbers(self, part: ObservationModelWithEffects, held_out: bool) -> NDArray[np.intp]:
-        """The block (N,) of each instant of a part; a table is two, as a row is no more like its neighbours."""
+        """The block (N,) of each instant of a part; a table has its folds."""
         if self.source is None:
-            return np.full(part.n, int(held_out))
+            rank = np.argsort(np.argsort(part.slip.mean(1), kind="stable"))
+            return np.full(part.n, self.options.folds) if held_out else np.asarray(rank % (self.options.folds - 1))
         return np.asarray((part.since / block_length(part.duration, self.options)).astype(int))
 
     def with_noise(self, factor: Mapping[str, float]) -> Record:
