@@ -93,9 +93,10 @@ class ShiftedEffect(NamedTuple):
 
 
 def shifted_effects(candidates: Sequence[Effect]) -> Iterator[list[ShiftedEffect]]:
-    """All further starts of the candidates, in groups of at most one for each effect."""
-    for group in zip_longest(*(_shifted(effect) for effect in candidates)):
+    """All further starts of the candidates, in groups of at most one for each effect; one that then acts is alone."""
+    for group in zip_longest(*(_shifted(effect) for effect in candidates if not effect.late)):
         yield [one for one in group if one is not None]
+    yield from ([one] for effect in candidates if effect.late for one in _shifted(effect))
 
 
 def _shifted(effect: Effect) -> Iterator[ShiftedEffect]:
@@ -155,6 +156,11 @@ class NormalEquations:
     n_new: int
     present: NDArray[np.intp]
     solved: Array
+
+    @property
+    def rise(self) -> float:
+        """By how much -2 log posterior is above that of the fit: where a candidate acts at its neutral values."""
+        return self.model.neg2_log_posterior - self.fitted.neg2_log_posterior
 
     def reduced(self, parameters: NDArray[np.intp], record: int = 0) -> Reduced:
         """Those of some candidates' parameters (P,); record: the recording, of parameters that each has for itself."""
@@ -218,8 +224,9 @@ def _score(effect: Effect, free: Sequence[Free], equations: NormalEquations) -> 
     for i in recordings:
         of_own = i if effect.of_record else 0
         starts.append(_start(equations, i, parameters, parts[of_own], solutions[of_own].step))
-    fall = sum(solution.fall for solution in solutions)
-    return Score(effect, fall, sum(solution.change for solution in solutions), tuple(starts))
+    rise = equations.rise if effect.late else 0.0  # from a further start of a delay
+    fall = sum(solution.fall for solution in solutions) - rise
+    return Score(effect, fall, sum(solution.change for solution in solutions) + rise, tuple(starts))
 
 
 class _Minimum(NamedTuple):
