@@ -7,7 +7,6 @@ from itertools import islice
 
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
-from soilbus.diagnosis.fleet import diagnose_type
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.simulator.reference import reference_configuration
@@ -43,12 +42,3 @@ def test_beside_an_effect_of_the_configuration():
     others = [CATALOGUE[name] for name in ("stress_peak_shift", "multipass", "bulldozing")]
     found = diagnose([second.with_effects([TYRE], free)], PRIOR, others)
     assert found.additions == ()
-
-
-def test_beside_an_effect_of_the_type():
-    hidden = fleet(33, {}, Fault("tyre_deflection:power", 0.007), vehicles=3, logs=1)
-    candidates = [TYRE, *(CATALOGUE[n] for n in ("rut_recovery", "drivetrain_loss", "lugs", "multipass"))]
-    shared, _ = diagnose_type(hidden.vehicles, PRIOR, candidates)
-    chances = {one.effect.name: one.probability for one in shared}
-    assert chances.pop("tyre_deflection") > 0.5
-    assert max(chances.values(), default=0.0) < 0.2
