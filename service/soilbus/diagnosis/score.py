@@ -159,8 +159,9 @@ class NormalEquations:
 
     @property
     def rise(self) -> float:
-        """By how much -2 log posterior is above that of the fit: where a candidate acts at its neutral values."""
-        return self.model.neg2_log_posterior - self.fitted.neg2_log_posterior
+        """By how much -2 log posterior is above that of the fit where a candidate acts at its neutral values."""
+        by_present = float(self.model.gradient[self.present] @ self.solved[:, 0])  # which they fall by without it
+        return self.model.neg2_log_posterior - by_present - self.fitted.neg2_log_posterior
 
     def reduced(self, parameters: NDArray[np.intp], record: int = 0) -> Reduced:
         """Those of some candidates' parameters (P,); record: the recording, of parameters that each has for itself."""

@@ -1062,11 +1062,11 @@ class ObservationModelWithEffects(ObservationModel):
             change = np.interp(self.t, load.t, filtered[:, 0] - along)
             curves = [("load", w, load), ("speed", w, speed), ("ground_speed", 0, ground)]
             smooth = np.stack([curve.at(self.t)[0] for _, _, curve in curves])
-            for i, (quantity, column, curve) in enumerate(curves):  # noise stays as large as it is
-                noisy = smooth.copy()
-                noisy[i] += np.nan_to_num(self.off_curve(quantity, column, curve))
-                of_noise = along_at(noisy) - along_at(smooth)
-                change += (self.kept_noise(quantity, column, curve, 0.0, 0.0, tau) - 1.0) * of_noise
+            noisy = smooth.copy()
+            for row, (quantity, column, curve) in zip(noisy, curves, strict=True):  # noise stays as large as it is
+                kept = self.kept_noise(quantity, column, curve, 0.0, 0.0, tau)
+                row += (kept - 1.0) * np.nan_to_num(self.off_curve(quantity, column, curve))
+            change += along_at(noisy) - along_at(smooth)
             off[:, w] = np.nan_to_num(change) * used
             slope[:, w] = np.interp(self.t, load.t, rate[:, 0]) * used
             by_tau[:, w] = -np.interp(self.t, load.t, behind[:, 0]) * used
