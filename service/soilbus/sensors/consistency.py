@@ -379,12 +379,17 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
 
 
 def wheel_derived_speed(data: ConsistencyInput) -> Iterator[str]:
-    """Yield the ground speed where it is the rim speed of wheels that pull, so without any slip."""
+    """Yield the ground speed where it is the rim speed of pulling wheels: no slip, nor more as they pull more."""
     options, every = data.options, list(range(len(data.rig.wheels)))
     for wheels in (*data.rig.axles, every):
         slip, grip = data.slip[:, wheels].mean(axis=1), data.traction[:, wheels].mean(axis=1)
-        slip = slip[(grip > options.driving_traction) & np.isfinite(slip)]
-        if len(slip) >= data.compared and median(np.abs(slip)) < options.no_slip:
+        known = np.isfinite(slip) & np.isfinite(grip)
+        slip, grip = slip[known], grip[known]
+        pulling = grip > options.driving_traction
+        if pulling.sum() < data.compared or median(np.abs(slip[pulling])) >= options.no_slip:
+            continue
+        r = float(np.corrcoef(grip, slip)[0, 1])
+        if r < 0.0 or r**2 * (len(slip) - 2) < options.significant_sd**2 * (1.0 - r**2):  # does not follow it
             yield "ground_speed"
             return
 
