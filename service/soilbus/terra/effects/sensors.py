@@ -106,11 +106,7 @@ CHANNEL_LAG = Effect(
     physics="A channel comes late: ground speed, draft, loads or pitch belong to a moment that has passed.",
     source=_DELAY_AND_LAG + "; receivers of positions tell speeds 0.1 to 0.3 s late",
     tells="quick changes of draft or speed; driving evenly hides it",
-    parameters=tuple(
-        Parameter(name, "s", 0.0, 0.2, low, 1.0)
-        for late in _OTHERS.values()
-        for name, low in ((late.delay, -0.2), (late.time_constant, 0.0))
-    ),
+    parameters=tuple(Parameter(name, "s", 0.0, 0.2, 0.0, 1.0) for late in _OTHERS.values() for name in late),
     late=_OTHERS,
 )
 
