@@ -26,7 +26,7 @@ from soilbus.diagnosis.blocks import expected_change
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import NormalEquations, normal_equations
-from soilbus.diagnosis.verdict import FALL_OF_NONE
+from soilbus.diagnosis.verdict import least_fall
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import NORMAL_95, SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
@@ -68,10 +68,8 @@ def detectable(
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     free = [f for effect in candidates for f in parameters_of(effect, present.checks[0].problem.n_wheels)]
     equations = normal_equations(records, prior, present, candidates, free)
-    found = []
-    for effect in candidates:
-        found.append(_detectable(effect, free, equations, data_ratio))
-    return tuple(found)
+    needed = least_fall(records[0].options.named_probability)
+    return tuple(_detectable(effect, free, equations, data_ratio, needed) for effect in candidates)
 
 
 def _detectable(
@@ -79,6 +77,7 @@ def _detectable(
     all_free: Sequence[Free],
     equations: NormalEquations,
     data_ratio: float,
+    needed: float,
 ) -> Detectable:
     parameter, recordings = effect.parameters[0], range(len(equations.iterates))
     most = _max_size(parameter)
@@ -86,13 +85,13 @@ def _detectable(
     free = [all_free[i] for i in columns.tolist()]
     parts = [equations.reduced(columns, i) for i in (recordings if effect.of_record else (0,))]
     informations = [data_ratio * one.information for one in parts]
-    cases = [(informations[0], FALL_OF_NONE)]
+    cases = [(informations[0], needed)]
     if effect.of_record:  # in one recording, while the others pay for parameters that they do not need
         unneeded = [_expected_change(information, np.zeros(len(free))) for information in informations]
         others = sum(unneeded)
-        cases = [(one, FALL_OF_NONE + others - own) for one, own in zip(informations, unneeded, strict=True)]
+        cases = [(one, needed + others - own) for one, own in zip(informations, unneeded, strict=True)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
-    sizes = [min(_least_size(information, i, free, needed, most) for information, needed in cases) for i in first]
+    sizes = [min(_least_size(information, i, free, fall, most) for information, fall in cases) for i in first]
     size = max(sizes)
     unseen = min(size, most)
     u = np.zeros(len(free))

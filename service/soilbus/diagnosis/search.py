@@ -1,7 +1,7 @@
 """Stepwise search for missing effects, with swaps.
 
     fall(e) = score of the model - score of the model with effect e                 (`blocks`)
-    add the e of the greatest fall, while it is more probable than none
+    add the e of the greatest fall, while it is more probable than none, and sure where the gap is within noise
     after each addition compare every effect with all candidates in its place:
         swap it where another explains more, remove it where none is more probable
 
@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from soilbus.arrays import Array
 from soilbus.diagnosis.delays import total_delays
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.gap import gap_of
 from soilbus.diagnosis.joint_fit import Start
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
@@ -97,8 +98,17 @@ class Search:
             found = self.with_swaps(wider)
             if found.score > present.score - self.options.negligible_fall:
                 return
+            additions = [self.addition(found, effect) for effect in self.added(found)]
+            if not gap_of(present).exceeds_noise(self.options) and not self._is_sure(present, additions[-1]):
+                return
             present = found
-            yield [self.addition(present, effect) for effect in self.added(present)], present
+            yield additions, present
+
+    def _is_sure(self, present: FittedModel, addition: Addition) -> bool:
+        """Whether something is surely missing; beside effects whose formulas may be off, whether it is this one."""
+        beside = any(f.std > 0.0 for f in present.free_unheld)
+        chance = addition.probability + (0.0 if beside else sum(addition.alternatives.values()))
+        return chance >= self.options.named_probability
 
     def added(self, model: FittedModel) -> list[Effect]:
         """Effects that the model has beside those of the base."""

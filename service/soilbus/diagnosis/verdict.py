@@ -104,6 +104,11 @@ def probabilities(falls: Mapping[str, Array]) -> dict[str, float]:
     return dict(sorted(zip(falls, chances, strict=True), key=lambda item: -item[1]))
 
 
+def least_fall(probability: float) -> float:
+    """Return the fall of the score from which an effect has this probability beside none, where all blocks agree."""
+    return FALL_OF_NONE + 2.0 * math.log(probability / (1.0 - probability))
+
+
 def soil_error_share(name: str, options: DiagnosisOptions = DEFAULT) -> float:
     """Share of the change of the soil's parameters by an effect of this name that counts as a standard deviation."""
     return options.tyre_soil_error_share if name == "tyre_deflection" else options.soil_error_share
