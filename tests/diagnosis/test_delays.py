@@ -49,7 +49,7 @@ def test_nothing_is_missing_where_loads_shake():
 
 
 @pytest.mark.xfail(
-    strict=True, reason="lateness, relaxation and the noise floor take a part: 0.056 s in place of 0.04 s"
+    strict=True, reason="standing parts take some: 0.056 s in place of 0.04 s"
 )
 def test_the_total_delay_of_a_torque_is_within_its_error():
     reported = diagnosed(503, "torque", 0.04).completed.parameters()["torque_lag"]
