@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from soilbus.estimation.linearisation import Latents
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
+from soilbus.estimation.observation_model import ObservationModel, inverse_covariance
 from soilbus.estimation.standing import STANDING, wheel_inertia
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load

@@ -7,7 +7,7 @@ import pytest
 
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -17,7 +17,7 @@ from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior

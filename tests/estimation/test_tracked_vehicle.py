@@ -24,7 +24,8 @@ from soilbus.decision.traversability import Status
 from soilbus.decision.wheels import wheel_table
 from soilbus.estimation.assembly import model_of, possible_effects, prior_of, rig_of
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import PARAMETERS, Posterior
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.drive import drive

@@ -30,7 +30,8 @@ from soilbus.config.file import load_config, machine
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import effects_and_parameters_of, model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
 from soilbus.pipeline.outputs import known
 from soilbus.report.table import table

@@ -20,7 +20,7 @@ from soilbus.config.model import Config, Vehicle
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.change_detection import Transition, without_transition
-from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import new_soil_prior
 from soilbus.pipeline.estimator import WindowEstimator

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.observation_model import RESIDUAL, Linearisation
+from soilbus.estimation.linearisation import RESIDUAL, Linearisation
 
 
 class BlockScores(NamedTuple):

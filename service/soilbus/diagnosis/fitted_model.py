@@ -23,9 +23,10 @@ from soilbus.diagnosis.joint_fit import Start, fit_jointly, own_gains, priors_of
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.linearisation import RESIDUAL, Latents, Linearisation
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.observation_model import RESIDUAL, Latents, Linearisation, ObservationModelWithEffects
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
+from soilbus.estimation.linearisation import Latents
 from soilbus.estimation.multistart import Fit, fit_at, fit_window
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import Latents, ObservationModel
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Solution, Termination, WindowModel, minimise

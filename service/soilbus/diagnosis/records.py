@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.linearisation import Linearisation
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import Linearisation, ObservationModelWithEffects
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.variance_components import VarianceComponents
 from soilbus.estimation.window import Rig, Window

@@ -20,7 +20,8 @@ from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
+from soilbus.estimation.linearisation import Latents, Linearisation
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
 
 __all__ = ["WARNING", "ResidualTerms", "Term", "residual_terms"]

@@ -22,7 +22,8 @@ from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import probabilities
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import active_at
-from soilbus.estimation.observation_model import ObservationModelWithEffects, inverse_covariance
+from soilbus.estimation.observation_model import inverse_covariance
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.wheel import Soil

@@ -30,7 +30,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.observation_model import RESIDUAL, Linearisation
+from soilbus.estimation.linearisation import RESIDUAL, Linearisation
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.window import Window
 

@@ -22,8 +22,9 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
+from soilbus.estimation.linearisation import Optimum
 from soilbus.estimation.model_form import FormPosterior
-from soilbus.estimation.observation_model import ObservationModel, Optimum
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, WindowModel, minimise

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.estimation.observation_model import RESIDUAL, Linearisation, ObservationModel
+from soilbus.estimation.linearisation import RESIDUAL, Linearisation
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.variance_components import block_sums
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from soilbus.estimation.observation_model import Work
+from soilbus.estimation.linearisation import Work
 
 __all__ = ["SearchBudget"]
 

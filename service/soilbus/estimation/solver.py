@@ -30,7 +30,8 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
-from soilbus.estimation.observation_model import FIRST_GAIN, SOIL, Latents, Linearisation, ObservationModel, Optimum
+from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior

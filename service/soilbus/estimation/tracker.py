@@ -33,7 +33,8 @@ from soilbus.estimation.last_run import passes_prior_conflict_test, prior_from_l
 from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior

@@ -22,7 +22,8 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import Row
-from soilbus.estimation.observation_model import RESIDUAL, Linearisation, ObservationModel, Optimum
+from soilbus.estimation.linearisation import RESIDUAL, Linearisation, Optimum
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import VarianceOptions
 from soilbus.estimation.window import Rig, Window
 

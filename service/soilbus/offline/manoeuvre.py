@@ -25,7 +25,7 @@ from soilbus.diagnosis.options import DEFAULT
 from soilbus.diagnosis.records import Record, TooLittle, record_of
 from soilbus.diagnosis.separation import Truth, expected_posterior, expected_probability, separations, truths
 from soilbus.estimation.assembly import effects_of, model_of, prior_of, rig_of
-from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.linearisation import Linearisation
 from soilbus.estimation.prediction import Share
 
 SPAN = 120.0

@@ -10,7 +10,8 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import model_of, rig_of
-from soilbus.estimation.observation_model import Linearisation, ObservationModel
+from soilbus.estimation.linearisation import Linearisation
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import ESTIMATOR, HELD, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig

@@ -18,8 +18,9 @@ from scipy.optimize import least_squares
 
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.linearisation import Latents, Linearisation
 from soilbus.estimation.multistart import Fit, fit_window
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import ESTIMATOR, HELD
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.simulator.recording import simulate

@@ -1,0 +1,196 @@
+"""Linearisation of a window's residuals: rows and columns by name, latents, derivatives, and the end point of a fit.
+
+rows of an instant     torques | balance | sinkages
+columns                residual | soil | sensor gains | effect parameters
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.arrays import Array
+from soilbus.terra.wheel import Soil
+
+RESIDUAL = 0
+"""Column of `Linearisation.rows` with the residual."""
+SOIL = slice(1, 1 + len(Soil._fields))
+"""Columns with the derivatives by the soil parameters."""
+FIRST_GAIN = SOIL.stop
+"""Column of the first nuisance parameter: the sensor gains, then the effect parameters."""
+
+
+class Layout(NamedTuple):
+    """Named slices of the residuals of W wheels.
+
+    rows of an instant (m): torques, balance, sinkages; latents (2 W + 1): loads, speeds, ground_speed.
+    columns: RESIDUAL | SOIL | sensor_columns | effect_columns; within `gains` (G,): sensors (torque_gains,
+    latent_gains in the order of the latents, draft_gain, standing as in `standing.STANDING`), then effects.
+    """
+
+    torques: slice
+    balance: int
+    sinkages: slice
+    n_latents: int
+    loads: slice
+    speeds: slice
+    ground_speed: int
+    sensors: slice
+    torque_gains: slice
+    latent_gains: slice
+    draft_gain: int
+    standing: slice
+    effects: slice
+    sensor_columns: slice
+    effect_columns: slice
+
+    @classmethod
+    def of(cls, W: int, n_sensors: int) -> Layout:
+        """The slices for W wheels; without columns of the sensor gains where n_sensors is 0."""
+        wheels, column = slice(W), FIRST_GAIN + n_sensors
+        return cls(
+            torques=wheels, balance=W, sinkages=slice(W + 1, None),
+            n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
+            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
+            draft_gain=3 * W + 1, standing=slice(3 * W + 2, n_sensors), effects=slice(n_sensors, None),
+            sensor_columns=slice(FIRST_GAIN, column),
+            effect_columns=slice(column, None),
+        )  # fmt: skip
+
+
+@dataclass(slots=True)
+class Work:
+    """Counter of model evaluations, in instants."""
+
+    instants: int = 0
+
+
+class Latents(NamedTuple):
+    """Latent unknowns of each instant: load [N], speed [rad/s], entry_angle [rad] (N, W); ground_speed [m/s] (N,)."""
+
+    load: Array
+    speed: Array
+    ground_speed: Array
+    entry_angle: Array
+
+    def followed_by(self, shared: int, new: Latents) -> Latents:
+        """The last `shared` instants of these, followed by `new`."""
+        return Latents(*[np.concatenate([own[-shared:], other]) for own, other in zip(self, new, strict=True)])
+
+    def joined(self) -> Array:
+        """Loads, speeds and ground speed (N, 2 W + 1)."""
+        return np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+
+    def part(self, instants: NDArray[np.intp] | NDArray[np.bool_]) -> Latents:
+        """The latents of the given instants, in that order."""
+        return Latents(*[own[instants] for own in self])
+
+
+@dataclass(slots=True)
+class Linearisation:
+    """Residuals and their derivatives at one point, and the derivatives that update the latents.
+
+    `rows` (R, 1 + 6 + G), R = N m, has the columns of `Layout`: residual, derivatives by the
+    soil parameters (SI), by the sensor gains (left out with by_sensors=False) and by the
+    effect parameters.  `weighed` is the inverse covariance of each instant times `rows`;
+    `normal` = rows' weighed (1 + 6 + G, 1 + 6 + G) holds chi-square, half its gradient and
+    the information.  Rows without a measurement are zero.
+    """
+
+    rows: Array
+    weighed: Array
+    normal: Array
+    by_latents: Array  # (N, m, 2 W + 1) by the observations of the latents
+    inverse: Array  # (N, m, m) inverse covariance of the rows of each instant
+    corrected: Array  # (N, 2 W + 1) observations of the latents over 1 + gain
+    variance: Array  # (N, 2 W + 1) variance of `corrected`
+    by_gain: Array  # (N, 2 W + 1) minus the derivative of `corrected` by its own gain
+    by_delay: Array  # (P, N, 2 W + 1) derivatives of `corrected` by the effect parameters; P = 0 without delays
+    load_residual: Array  # (N, W) latent load less the model's load at the latent entry angle
+    load_slope: Array  # (N, W) derivative of the model's load by the entry angle; the next three by slip, soil, effects
+    load_by_slip: Array
+    load_by_soil: Array  # (6, N, W)
+    load_by_effects: Array  # (P, N, W)
+    rolling_slip: Array  # (N, F) slips of the free wheels after a Newton step
+    side_load: Array  # (N, S) loads left less right behind differentials after a Newton step
+    by_sides: Array  # (N, S, m) derivatives of the rows by those of equal torques, which are used up for these loads
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squares of the whitened residuals."""
+        return float(self.normal[0, 0])
+
+
+@dataclass(slots=True)
+class Optimum:
+    """End point of a fit: soil (6,) in SI, gains (G,), latents at times t (N,) [s], and the linearisation there."""
+
+    t: Array
+    soil: Array
+    gains: Array
+    latents: Latents
+    at: Linearisation
+
+
+class Response(NamedTuple):
+    """Drawbar pull [N], torque [N m] and sinkage [m], value (3, N, W), of wheels that carry the latent loads.
+
+    by_load, by_speed, by_ground (3, N, W), by_soil (3, 6, N, W) and by_effects (3, P, N, W)
+    are their derivatives by the latents, the soil parameters and the effect parameters.
+    load_by_slip (N, W), load_by_soil (6, N, W), load_by_effects (P, N, W) and load_slope
+    (N, W) are derivatives of the load at the latent entry angle, the last by that angle;
+    load_residual (N, W) [N] is the latent load less the model's.  extra_pull (N,) [N] is the
+    pull that effects ask of the wheels beyond the measured demand; extra_pull_by_effects
+    (P, N) its derivatives.
+    """
+
+    value: Array
+    by_load: Array
+    by_speed: Array
+    by_ground: Array
+    by_soil: Array
+    load_by_slip: Array
+    load_by_soil: Array
+    load_by_effects: Array
+    load_slope: Array
+    load_residual: Array
+    by_effects: Array
+    extra_pull: Array
+    extra_pull_by_effects: Array
+
+    def rolling(self, free: NDArray[np.bool_]) -> Response:
+        """The response with the slips of free wheels (mask (W,)) eliminated by T = 0, to first order.
+
+        y <- y - (dy/ds) / (dT/ds) T for pull and sinkage and all their derivatives; nothing depends on their speeds.
+        """
+        torque = self.by_speed[1][:, free]
+        ratio = self.by_speed[:, :, free] / np.where(torque == 0.0, np.inf, torque)
+        for values in (self.value, self.by_load):
+            values[:, :, free] -= ratio * values[1][:, free]
+        for values in (self.by_soil, self.by_effects):
+            values[..., free] -= ratio[:, None] * values[1][..., free]
+        self.by_speed[:, :, free] = 0.0
+        self.by_ground[:, :, free] = 0.0
+        return self
+
+
+class DelayTerms(NamedTuple):
+    """Corrections of the measurements for delays, and their derivatives by the P effect parameters.
+
+    torque (N, W) [N m], measured (N, 2 W + 1) of the latents and demand (N,) [N] are the
+    measurements without delay less those taken; by_torque (P, N, W), by_measured and
+    by_demand are their derivatives.  predicted (N, W) [N m] is the model's torque after a low
+    pass less that before; by_predicted (P, N, W) its derivatives.
+    """
+
+    torque: Array
+    measured: Array
+    demand: Array
+    predicted: Array
+    by_torque: Array
+    by_measured: Array
+    by_demand: Array
+    by_predicted: Array

@@ -1,0 +1,432 @@
+"""Observation model with effects: the hooks of effects in torque, draft balance and sinkage, and delays of channels.
+
+gains     sensor gains | effect parameters, standardised: (value - prior value) / prior sd
+delayed   y(t + d) in place of y(t), through a low pass where the effect has one
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.estimation.linearisation import (
+    DelayTerms,
+    Latents,
+    Response,
+)
+from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_derivatives
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
+from soilbus.terra.effects.along import through_low_pass
+from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
+from soilbus.terra.soil_laws import lumped_modulus
+from soilbus.terra.tangent import forces_along
+from soilbus.terra.vehicle import GRAVITY
+from soilbus.terra.wheel import (
+    MAX_ENTRY_ANGLE,
+    MIN_ENTRY_ANGLE,
+    Soil,
+    WheelModel,
+    WheelState,
+    sinkage,
+    wheel_forces,
+)
+
+_TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
+"""Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
+
+_DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
+_SOIL_NAMES = Soil._fields
+
+
+class ObservationModelWithEffects(ObservationModel):
+    """An observation model whose wheel-soil model has effects; `free` are the effects' P parameters.
+
+    In `gains` they follow the sensor gains, standardised: (value - prior value) / prior sd,
+    so zero with variance one before any data.  Soil, latents and parameters go through the
+    effects' hooks with their derivatives (see terra.dual) in one integration.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        rig: Rig,
+        model: WheelModel,
+        min_speed: float,
+        max_turn: float = 0.15,
+        effects: Sequence[Effect] = (),
+        free: Sequence[Free] = (),
+    ) -> None:
+        super().__init__(window, rig, model, min_speed, max_turn)
+        self._set_effects(effects, free)
+
+    def with_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
+        """The same measurements under a model with these effects alone and their free parameters."""
+        other = copy(self)
+        other._set_effects(effects, free)
+        return other
+
+    def _set_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
+        self.effects, self.free = tuple(effects), tuple(free)
+        self._named = {effect.name: effect for effect in self.effects}
+        std = [float(f.std > 0.0) for f in self.free]
+        self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
+        self.gain_std = np.concatenate([self._sensor_std(), std])
+        bounds = np.array([f.bounds for f in self.free]).reshape(-1, 2)
+        self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
+
+    def _sensor_std(self) -> Array:
+        """Return the prior sd of the sensors' gains; a channel that an effect delays has no lateness beside it.
+
+        Two shifts of opposite sign would leave a second difference, which takes up noise.
+        """
+        fitted = {(f.effect, f.parameter.name) for f in self.free if f.std > 0.0}
+        late = [q for e in self.effects for q, names in e.late.items() if (e.name, names.delay) in fitted]
+        names, std = [name.split(".") for name in self.gain_names[: self.n_sensors]], self.sensor_std.copy()
+        for quantity in late:  # of torques the first one's: the others' may differ from it
+            std[next((i for i, name in enumerate(names) if name[:2] == ["lateness", quantity]), len(std)) :][:1] = 0.0
+        return std
+
+    def active(self, standardised: Array) -> list[Active]:
+        """The effects with their values at standardised parameters (P,)."""
+        return active_at(self.effects, self.free, standardised, self.n_wheels)
+
+    def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
+        if not self.effects:
+            return super()._response(soil, gains, latents)
+        standardised = gains[self.layout.effects]
+        active = active_with_derivatives(self.effects, self.free, standardised, self.n_wheels)
+        varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
+        wheels = self._wheels(_varied(soil), active, varied, varied.entry_angle)
+        contact = self._contact(wheels, active, forces_along(wheels.state, wheels.model))
+        load, drawbar, torque, depth = self._predicted(contact, active, varied)
+        surroundings = self._surroundings(latents)
+        pull = self._extra_pull(contact.forces[1].only(int), active, surroundings)
+        at, by_latents, by_soil, by_effects = _gathered(
+            (load, drawbar, torque, depth), len(self.free), (self.n, self.n_wheels)
+        )
+        np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
+        pull_by_effects = np.zeros((len(self.free), self.n))
+        for i in range(len(self.free)):
+            pull_by_effects[i] = slope_of(pull, i)
+        by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
+        slope, off = by_angle[0], -at[0]
+        by_carried_load = by_angle[1:] / slope  # derivatives by the load through the entry angle
+
+        def held(d: Array) -> Array:
+            """Derivatives (3, ..., N, W) with the entry angle following the load."""
+            return np.asarray(d[1:] - (by_carried_load[:, None] if d.ndim == 4 else by_carried_load) * d[0])
+
+        value = at[1:] + by_carried_load * off
+        return Response(
+            value=value,
+            by_load=held(by_load),
+            by_speed=held(by_speed),
+            by_ground=held(by_ground),
+            by_soil=held(by_soil),
+            load_by_slip=by_speed[0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
+            load_by_soil=by_soil[0],
+            load_by_effects=by_effects[0],
+            load_slope=slope,
+            load_residual=off,
+            by_effects=held(by_effects),
+            extra_pull=np.asarray(value_of(pull)),
+            extra_pull_by_effects=pull_by_effects,
+        )
+
+    def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
+        """The wheels at entry angles (N, W) [rad], with the radii and sinkages that the effects give them."""
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
+        state = WheelState(
+            angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K, self.rig.length
+        )
+        surroundings = self._surroundings(latents)
+        state, model = wheel_with(active, state, self.model, surroundings)
+        return _Wheels(state, model, sinkage(angle, state.radius), surroundings)
+
+    def _contact(self, wheels: _Wheels, active: Sequence[Active], forces: Forces) -> _Contact:
+        """Contact of wheels and ground, from the integrated forces."""
+        forces = reactions_with(active, forces, wheels.state, wheels.surroundings)
+        return _Contact(forces, wheels.depth, wheels.surroundings)
+
+    def _excess_load(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> Any:
+        """Load [N] (N, W) that the soil carries in excess of the latent load."""
+        excess = contact.forces[0] - latents.load
+        for effect, values in active:
+            if effect.load is not None:
+                excess = excess + effect.load(contact.surroundings, values)
+        return excess
+
+    def _predicted(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> tuple[Any, Any, Any, Any]:
+        """Excess load [N], drawbar pull [N], predicted torque measurement [N m] and sinkage [m] (N, W)."""
+        _, pull, torque = contact.forces
+        for effect, values in active:
+            if effect.torque is not None:
+                torque = effect.torque(torque, contact.surroundings, values)
+        return self._excess_load(contact, active, latents), pull, torque, contact.depth
+
+    def _extra_pull(self, pull: Dual, active: Sequence[Active], surroundings: Surroundings) -> Any:
+        """Pull [N] (N,) asked of the wheels beyond the measured demand; pull (N, W) [N] is the wheels' own."""
+        missing, draft = self._unmeasured(active, surroundings, pull.sum(axis=1))
+        return missing + draft - self.draft
+
+    def _unmeasured(self, active: Sequence[Active], surroundings: Surroundings, pull: Any) -> tuple[Any, Any]:
+        """Resistances [N] (N,) that no sensor measures, and drafts [N] (N,) less the sensor errors of effects.
+
+        Both use the draft and the acceleration estimated from the whole balance, not their
+        measurements: a measurement's own noise, beside an error proportional to it, would
+        make a larger draft and a smaller mass fit better (errors in variables).
+        """
+
+        def resistance(surroundings: Surroundings) -> Any:
+            parts = [
+                effect.resistance(surroundings, values) for effect, values in active if effect.resistance is not None
+            ]
+            return sum(parts, np.zeros(self.n))
+
+        draft = true_draft(active, self.draft, surroundings)
+        off = self.inertia + draft + resistance(surroundings) - pull
+        by_draft, by_acceleration = self._noise_shares
+        estimated = surroundings._replace(acceleration=surroundings.acceleration - (by_acceleration * off)[:, None])
+        errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
+        if errors:
+            true = draft - by_draft * off
+            draft = self.draft - sum(error(true, estimated, values) for error, values in errors)
+        return resistance(estimated), draft
+
+    @property
+    def _noise_shares(self) -> tuple[Array, Array]:
+        """Shares of draft [1] and acceleration [1/kg] (N,) in a residual of 1 N of the balance, by their noise."""
+        mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
+        known = self.draft_var > 0.0
+        by_draft, by_acceleration = (
+            np.divide(variance, self.demand_var, out=np.zeros(self.n), where=known)
+            for variance in (self.draft_var, mass * self.acceleration_var)
+        )
+        return by_draft, by_acceleration
+
+    def _surroundings(self, latents: Latents) -> Surroundings:
+        chassis = self.rig.chassis
+        return Surroundings(
+            t=self.since[:, None],
+            distance=self.distance[:, None],
+            load=latents.load,
+            ground_speed=latents.ground_speed[:, None],
+            wheel_speed=latents.speed,
+            rear=~self.rig.front,
+            draft=self.draft[:, None],
+            acceleration=self.acceleration[:, None],
+            mass=0.0 if chassis is None else chassis.mass,
+            duration=self.duration,
+            length=self.length,
+        )
+
+    def delay_terms(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
+        """Corrections for measurements y late by d and by a low pass of tau: x(t) = (1 + tau d/dt) y(t + d).
+
+        Parameters
+        ----------
+        gains : Array
+            Sensor gains, then effect parameters (G,).
+        latents : Latents
+            Of all N instants.
+        torque : Array
+            Torques of the model (N, W) [N m].
+
+        Notes
+        -----
+        y(t + d) = s(t + d) + c (y(t) - s(t)) with the smooth curve s of the measurements (see
+        local_cubics): the noise of an instant stays with it, and c keeps its variance.  Else every
+        delay would pair other noises or cancel a part, and some would seem to fit better.
+        Torques are predicted by the model: there the low pass and the derivatives act on the
+        prediction, since slopes of measurements have noise that would count as information.
+        """
+        places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
+        standardised, P = gains[self.layout.effects], len(self.free)
+        found: dict[str, tuple[Array, Array]] = {}
+        predicted, by_predicted = np.zeros_like(torque), np.zeros((P, *torque.shape))
+        for effect in self.effects:
+            for quantity, (delay, time_constant) in effect.late.items():
+                at = places[effect.name, delay], places[effect.name, time_constant]
+                if all(self.free[i].std == 0.0 and self.free[i].value == 0.0 for i in at):
+                    continue
+                added, by = found.setdefault(quantity, self._no_delay(quantity, P))
+                d, tau = (self.free[i].at(float(standardised[i])) for i in at)
+                std, of_tau = (self.free[i].std for i in at)
+                if quantity == "torque":
+                    predicted, rate, by_tau = self._low_pass_terms(tau, latents, torque)
+                    by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
+                    tau, std, of_tau = 0.0, 0.0, 0.0
+                for column, series in enumerate(self._curves.of(quantity)):
+                    curve = series.smooth
+                    _, slope, second = curve.at(self.t + d)
+                    added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d, tau))
+                    by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
+                    by[at[1], :, column] += of_tau * np.nan_to_num(slope)
+        if not found:
+            return None
+        torques, load, ground, draft, pitch = (
+            found.get(q) or self._no_delay(q, P) for q in ("torque", "load", "ground_speed", "draft", "pitch")
+        )
+        loads, speed = self.layout.loads, self.layout.ground_speed
+        measured = np.zeros((self.n, self.layout.n_latents))
+        by_measured = np.zeros((P, *measured.shape))
+        measured[:, loads], measured[:, speed] = load[0] * self.usable, ground[0][:, 0]
+        by_measured[:, :, loads], by_measured[:, :, speed] = load[1] * self.usable, ground[1][:, :, 0]
+        weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)
+        if self._latent_matrix is not None:
+            measured, by_measured = measured @ self._latent_matrix.T, by_measured @ self._latent_matrix.T
+        return DelayTerms(
+            torque=self.torque_rows(torques[0]),
+            measured=measured,
+            demand=draft[0][:, 0] + weight * pitch[0][:, 0],
+            predicted=self.torque_rows(predicted),
+            by_torque=self.torque_rows(torques[1]),
+            by_measured=by_measured,
+            by_demand=draft[1][:, :, 0] + weight * pitch[1][:, :, 0],
+            by_predicted=self.torque_rows(by_predicted),
+        )
+
+    def _low_pass_terms(self, tau: float, latents: Latents, torque: Array) -> tuple[Array, Array, Array]:
+        """Change [N m] of the model's torques (N, W) by a low pass of tau [s]; their slope after it; derivative by tau.
+
+        Between instants and where some are left out, torques follow from the curves of loads
+        and speeds by a polynomial in load and slip through the model's own torques.
+        """
+        off, slope, by_tau = (np.zeros(torque.shape) for _ in range(3))
+        loads, speeds, (ground,) = (
+            [series.smooth for series in self._curves.of(q)] for q in ("load", "speed", "ground_speed")
+        )
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        for w, (load, speed) in enumerate(zip(loads, speeds, strict=True)):
+            used = self.usable[:, w]
+            if len(load.t) < 2 or np.count_nonzero(used) < 2 * len(_TORQUE_POWERS):
+                continue
+            states = np.stack([latents.load[used, w], slip[used, w]])
+            middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
+            basis = _monomials((states - middle) / size)
+            by_power = np.linalg.lstsq(basis, torque[used, w], rcond=None)[0]
+
+            def along_at(latents: Array, w: int = w, states: Array = states, by_power: Array = by_power) -> Array:
+                """Torques (N,) at load, speed and ground speed (3, N)."""
+                rim = np.maximum(self.rig.radius[w] * latents[1], 1e-3)
+                path = np.clip(np.stack([latents[0], 1.0 - latents[2] / rim]).T, *np.sort(states)[:, [0, -1]].T).T
+                middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
+                return np.asarray(_monomials((path - middle) / size) @ by_power)
+
+            along = along_at(np.stack([load.value, speed.at(load.t)[0], ground.at(load.t)[0]]))
+            filtered = through_low_pass(load.t, along[:, None], tau)
+            rate = (along[:, None] - filtered) / tau if tau > 0.0 else np.gradient(along, load.t)[:, None]
+            behind = through_low_pass(load.t, rate, tau)
+            change = np.interp(self.t, load.t, filtered[:, 0] - along)
+            curves = [("load", w, load), ("speed", w, speed), ("ground_speed", 0, ground)]
+            smooth = np.stack([curve.at(self.t)[0] for _, _, curve in curves])
+            noisy = smooth.copy()
+            for row, (quantity, column, curve) in zip(noisy, curves, strict=True):  # noise stays as large as it is
+                kept = self.kept_noise(quantity, column, curve, 0.0, 0.0, tau)
+                row += (kept - 1.0) * np.nan_to_num(self.off_curve(quantity, column, curve))
+            change += along_at(noisy) - along_at(smooth)
+            off[:, w] = np.nan_to_num(change) * used
+            slope[:, w] = np.interp(self.t, load.t, rate[:, 0]) * used
+            by_tau[:, w] = -np.interp(self.t, load.t, behind[:, 0]) * used
+        return off, slope, by_tau
+
+    def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
+        """Zero corrections (N, columns) and derivatives (P, N, columns)."""
+        columns = self._curves.number_of(quantity)
+        return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
+
+    def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+        """As `ObservationModel.with_entry_angles`; without gains the effect parameters are at their prior values."""
+        solved = np.isfinite(latents.entry_angle).all() and bool(self.effects)
+        base = latents if solved else super().with_entry_angles(latents, soil, gains)
+        if not self.effects:
+            return base
+        active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.layout.effects])
+        angle = base.entry_angle
+
+        def excess(angle: Array) -> Array:
+            wheels = self._wheels(soil, active, base, angle)
+            contact = self._contact(wheels, active, wheel_forces(wheels.state, wheels.model))
+            return np.asarray(self._excess_load(contact, active, base))
+
+        off = excess(angle)
+        with np.errstate(all="ignore"):
+            slope = (2.0 * soil.n + 1.0) * base.load  # by the angle's logarithm, for small angles; then secants
+            for _ in range(6):
+                step = np.where(slope > 0.0, -off / slope, 0.0)
+                new_angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
+                if np.abs(step).max(initial=0.0) < 0.01:
+                    angle = new_angle
+                    break
+                new_excess = excess(new_angle)
+                secant = (new_excess - off) / np.log(new_angle / angle)  # where not positive the last slope stays
+                slope = np.where((secant > 0.0) & np.isfinite(secant), secant, slope)
+                angle, off = new_angle, new_excess
+        return Latents(base.load, base.speed, base.ground_speed, angle)
+
+    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """As `ObservationModel.sinkages`, with the radii that the effects give the wheels."""
+        if not self.effects:
+            return super().sinkages(soil, gains, latents)
+        active = self.active(gains[self.layout.effects])
+        return np.broadcast_to(self._wheels(soil, active, latents, latents.entry_angle).depth, latents.load.shape)
+
+    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
+        if not self.effects:
+            return super()._wheels_in_contact(soil, gains, latents)
+        wheels = self._wheels(soil, self.active(gains[self.layout.effects]), latents, latents.entry_angle)
+        return wheels.state, wheels.model
+
+
+class _Contact(NamedTuple):
+    """Load [N], drawbar pull [N] and torque [N m] between wheels and ground, sinkage [m] (N, W), surroundings."""
+
+    forces: Forces
+    depth: Any
+    surroundings: Surroundings
+
+
+class _Wheels(NamedTuple):
+    """Wheel states and model after the effects' `wheel` hooks, sinkages [m] (N, W), surroundings."""
+
+    state: WheelState
+    model: WheelModel
+    depth: Any
+    surroundings: Surroundings
+
+
+def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+    """Values (M, N, W), their derivatives by latents (M, 4, N, W), soil (M, 6, N, W) and parameters (M, P, N, W)."""
+    kinds = (), (len(_DUAL_LATENTS),), (len(_SOIL_NAMES),), (n_effects,)
+    at, by_latents, by_soil, by_effects = (np.zeros((len(predicted), *kind, *shape)) for kind in kinds)
+    for i, one in enumerate(predicted):
+        at[i] = value_of(one)
+        for quantity, d in one.by.items() if isinstance(one, Dual) else ():
+            if isinstance(quantity, int):
+                by_effects[i, quantity] = d
+            elif quantity in _DUAL_LATENTS:
+                by_latents[i, _DUAL_LATENTS.index(quantity)] = d
+            else:
+                by_soil[i, _SOIL_NAMES.index(quantity)] = d
+    return at, by_latents, by_soil, by_effects
+
+
+def _monomials(states: Array) -> Array:
+    """Products (N, len(_TORQUE_POWERS)) of powers of load and slip (2, N)."""
+    load, slip = (
+        [value**i for i in range(highest + 1)] for value, highest in zip(states, _TORQUE_POWERS[-1], strict=True)
+    )
+    return np.stack([load[i] * slip[j] for i, j in _TORQUE_POWERS], axis=1)
+
+
+def _varied(soil: Soil) -> Soil:
+    """The soil with derivatives by each parameter but k_c, whose derivative is that of k_phi over the width."""
+    varied = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
+    return soil._replace(**varied)  # type: ignore[arg-type]
