@@ -167,8 +167,10 @@ FAULTS = {
     "nothing": Fault(le.both(), GOOD, "none"),
     # silent from the start, and from a moment on
     **{
-        f"{m} deleted": Fault(le.cut(m), frozenset({Status.INVALID}), f"input_missing {names}", since=FROM_THE_START)
-        for m, names in STREAMS.items()
+        f"{m} deleted": Fault(
+            le.cut(m), frozenset({Status.INVALID}), f"input_missing {STREAMS[m]}", since=FROM_THE_START
+        )
+        for m in ("AxleLoads", RADAR)
     },
     **{f"{m} cut": Fault(le.cut(m), BAD, f"input_stale {names}") for m, names in STREAMS.items()},
     "RideHeight deleted": Fault(le.cut("RideHeight"), GOOD, "none", since=FROM_THE_START),
