@@ -143,14 +143,6 @@ def test_what_the_worker_says_of_the_time_before_the_clock_was_set_is_not_taken(
     assert drive.faults == []
 
 
-def test_go_after_soft_ground_needs_two_windows():
-    drive = played(cheap(), [Event({"soft": True}, 1.2), Event({}, 1.0)])
-    assert str(drive.last["State"]) != "go"
-    drive.run(1.2)
-    assert str(drive.last["State"]) == "go"
-    assert drive.faults == []
-
-
 @pytest.mark.parametrize("by", [0.0, -3600.0, 3600.0])
 def test_a_torque_limit_that_is_not_sent_any_more_holds(by):
     drive = played(cheap(), [])
