@@ -130,7 +130,7 @@ def test_a_command_works_in_one_thread_unless_told_otherwise(told, threads, tmp_
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     environment |= {} if told is None else {"OMP_NUM_THREADS": told}
     (tmp_path / "empty.toml").write_text("")
-    command = [sys.executable, "-c", THREADS, "decisions", "--config", str(tmp_path / "empty.toml")]
+    command = [sys.executable, "-c", THREADS, "check", "--config", str(tmp_path / "empty.toml")]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60.0, env=environment)
     pools = done.stdout.split()
     assert pools

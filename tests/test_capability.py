@@ -122,8 +122,7 @@ def test_unlimited_pull_is_the_best_over_slip(name):
     assert able.max_grade.value == pytest.approx(math.asin(steepest / WEIGHT), abs=3e-4)
 
 
-@pytest.mark.parametrize("name", ["loam", "wet_clay", "dry_sand"])
-@pytest.mark.parametrize("dead", ["front", "rear"])
+@pytest.mark.parametrize(("name", "dead"), [("loam", "front"), ("wet_clay", "rear"), ("dry_sand", "front")])
 def test_a_wheel_that_cannot_drive_rolls(name, dead):
     # Its limit is 0: it holds the vehicle back as a rolling wheel does, and no more.
     soil, limit = SOILS[name], np.where(RIG.front == (dead == "front"), 0.0, np.nan)

@@ -66,23 +66,6 @@ def test_json_to_stdout_is_nothing_but_json(log, tractor, capsys):
     assert err == []
 
 
-@pytest.mark.parametrize("suffix", [".log.gz", ".asc", ".blf", ".csv"])
-def test_other_formats_give_the_same_windows(log, tractor, tmp_path, suffix):
-    other = tmp_path / f"a.b{suffix}"
-    if suffix == ".log.gz":
-        other.write_bytes(gzip.compress(log.read_bytes()))
-    else:
-        with can.Logger(other) as writer:
-            for message in can.LogReader(log):
-                writer(message)
-    for path, name in ((log, "a"), (other, "b")):
-        assert main(["replay", "--config", str(tractor), str(path), "--json", str(tmp_path / name)]) == 0
-    a, b = ([json.loads(x) for x in (tmp_path / n).read_text().splitlines()] for n in "ab")
-    assert [w["status"] for w in a] == [w["status"] for w in b]
-    values = np.array([[w["bearing_pressure"]["value"] for w in ws] for ws in (a, b)])
-    assert values[1] == pytest.approx(values[0], rel=1e-3)  # .asc keeps times to 0.1 ms only
-
-
 def broken(kind: str, log: Path, to: Path) -> Path:
     data = log.read_bytes()
     if kind == "midway.log":
@@ -115,14 +98,6 @@ def test_a_bad_log_is_one_line_and_leaves_no_file(kind, log, tractor, tmp_path, 
     assert "Traceback" not in err[0]
     assert printed == []
     assert [p.name for p in tmp_path.iterdir() if "jsonl" in p.name] == []
-
-
-def test_partial_keeps_the_windows_before_the_cut(log, tractor, tmp_path, capsys):
-    path = broken("midway.log", log, tmp_path)
-    out = tmp_path / "out.jsonl"
-    assert main(["replay", "--config", str(tractor), str(path), "--partial", "--json", str(out)]) == 0
-    assert len(out.read_text().splitlines()) >= 2
-    assert "cut off" in lines(capsys)[1][0]
 
 
 @pytest.mark.parametrize(

@@ -362,7 +362,7 @@ def test_at_the_edge_of_a_soft_patch_the_warning_comes_as_soon_as_it_can_be_felt
 @pytest.mark.parametrize("kind", firm_drives.FIRM_KINDS)
 def test_firm_ground_is_left_in_peace(kind, monkeypatch):
     monkeypatch.setattr(firm_drives, "DRIVE_TIME", 60.0)
-    found = trial(Task(CONFIG, kind, 1))
+    found = trial(Task(reference_configuration(["estimator.hop=2.0"]), kind, 1))
     assert found.seconds == pytest.approx(50.0, abs=0.2)
     assert found.warnings == 0
     assert math.isnan(found.lead)

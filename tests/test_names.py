@@ -53,9 +53,9 @@ def each_of(*names: str) -> pytest.MarkDecorator:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nine seconds with a position."""
+    """Six seconds with a position."""
     path = tmp_path_factory.mktemp("drive") / "drive.log"
-    assert main(["simulate", "--duration", "9", "--seed", "4", "--start", "48", "11", "--log", str(path)]) == 0
+    assert main(["simulate", "--duration", "6", "--seed", "4", "--start", "48", "11", "--log", str(path)]) == 0
     return path
 
 
@@ -109,80 +109,92 @@ def check_page(path: Path, name: str) -> None:
     assert name in page.text
 
 
-@each_of(*UNTIDY)
-def test_names_of_files_and_folders_are_text_in_every_output(name, drive, tmp_path, says):
-    name = name.replace("/", "_")
-    folder = tmp_path / name
+@pytest.fixture
+def logs(drive, tmp_path) -> list[Path]:
+    """The drive under every untidy name, in a folder of such a name."""
+    folder = tmp_path / UNTIDY[2]
     folder.mkdir()
-    log, other = folder / f"{name}.log", folder / "other.log"
-    shutil.copy(drive, log)
-    shutil.copy(drive, other)
-    dbc = folder / f"{name}.dbc"
-    shutil.copy(shipped_dbc("tractor.dbc"), dbc)
-    config = folder / f"{name}.toml"
-    document = tomlkit.parse(machine("tractor").read_text())
-    document["dbc"]["input"] = [dbc.name]
-    config.write_text(tomlkit.dumps(document))
-    of = ["--config", config, *SHORT]
-    assert says("check", *of, "--log", log)[0] == 0
+    return [Path(shutil.copy(drive, folder / f"{name.replace('/', '_')}.log")) for name in UNTIDY]
+
+
+def test_names_of_files_and_folders_are_text_in_every_output(logs, says):
+    folder, labels = logs[0].parent, [shown(log.name) for log in logs]
+    for log in logs:
+        dbc, config, made = (folder / f"{log.stem}{suffix}" for suffix in (".dbc", ".toml", " made.toml"))
+        shutil.copy(shipped_dbc("tractor.dbc"), dbc)
+        document = tomlkit.parse(machine("tractor").read_text())
+        document["dbc"]["input"] = [dbc.name]
+        config.write_text(tomlkit.dumps(document))
+        of = ["--config", config, *SHORT]
+        beginning = folder / f"{log.stem} beginning.log"
+        beginning.write_text("".join(log.read_text().splitlines(keepends=True)[:500]))
+        assert says("check", *of, "--log", beginning)[0] == 0
+        assert says("init", "--dbc", dbc, "--log", beginning, "-o", made)[0] == 0
+        assert tomllib.loads(made.read_text(encoding="utf-8"))["dbc"]["input"] == [dbc.name]
+        assert says("check", "--config", made)[0] == 2  # open values
+    assert says("init", "--dbc", dbc)[0] == 0
     outputs = ["--json", "w.jsonl", "--report", "r.html", "--table", "t.csv", "--map", "m.geojson", "--isoxml", "iso"]
     there = [folder / word if "." in word or word == "iso" else word for word in outputs]
-    frames = folder / f"{name} sent.log"
-    code, out, _ = says("replay", *of, log, other, *there, "--frames", frames)
+    frames = folder / f"{log.stem} sent.log"
+    code, out, _ = says("replay", *of, *logs, *there, "--frames", frames)
     assert code == 0
-    label = shown(log.name)
-    assert label in out
     windows = [json.loads(line) for line in (folder / "w.jsonl").read_text().splitlines()]
-    assert {window["log"] for window in windows} == {label, "other.log"}
-    check_page(folder / "r.html", label)
+    assert {window["log"] for window in windows} == set(labels)
+    for label in labels:
+        assert label in out
+        check_page(folder / "r.html", label)
     with (folder / "t.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(windows)
-    assert {row["log"].removeprefix("'") for row in rows} == {label, "other.log"}
+    assert {row["log"].removeprefix("'") for row in rows} == set(labels)
     assert not {row["log"][0] for row in rows} & set("=+-@\t\r")
     points = json.loads((folder / "m.geojson").read_text())["features"]
-    assert {point["properties"]["log"] for point in points} == {label, "other.log"}
+    assert {point["properties"]["log"] for point in points} == set(labels)
     tasks = ElementTree.parse(folder / "iso/TASKDATA.XML").getroot().findall("TSK")
-    assert [task.get("B") for task in tasks] == [f"soilbus {label}"[:32], "soilbus other.log"]
+    assert [task.get("B") for task in tasks] == [f"soilbus {label}"[:32] for label in labels]
     assert says("watch", frames, "--speed", "1000", "--plain")[0] == 0
     code, out, _ = says("watch", frames, "--speed", "1000", "--json")
     assert code == 0
     assert all(json.loads(line) for line in out.splitlines())
-    made = folder / f"{name} made.toml"
-    assert says("init", "--dbc", dbc, "--log", log, "-o", made)[0] == 0
-    assert tomllib.loads(made.read_text(encoding="utf-8"))["dbc"]["input"] == [dbc.name]
-    assert says("init", "--dbc", dbc)[0] == 0
-    assert says("check", "--config", made)[0] == 2  # open values
 
 
-@each_of(*UNTIDY[:3])
-def test_a_diagnosis_and_a_batch_show_names_as_text(name, drive, tmp_path, says):
-    name = name.replace("/", "_")
-    log, other = tmp_path / f"{name}.log", tmp_path / "other.log"
-    shutil.copy(drive, log)
-    assert says("simulate", "--duration", "9", "--seed", "5", "--log", other)[0] == 0
-    found, page, model = (tmp_path / each for each in ("d.json", "d.html", f"{name}.toml"))
-    command = ["diagnose", "--config", "tractor", *SHORT, log, other, "--json", found, "--report", page]
+def test_a_diagnosis_and_a_batch_show_names_as_text(logs, says):
+    folder, logs = logs[0].parent, logs[:2]
+    assert says("simulate", "--duration", "9", "--seed", "5", "--log", logs[1])[0] == 0
+    found, page, model = (folder / each for each in ("d.json", "d.html", f"{logs[0].stem}.toml"))
+    command = ["diagnose", "--config", "tractor", *SHORT, *logs, "--json", found, "--report", page]
     assert says(*command, "--model-out", model)[0] == 0
-    assert {soil["log"] for soil in json.loads(found.read_text())["soils"]} == {shown(log.name), "other.log"}
-    check_page(page, shown(log.name))
+    assert {soil["log"] for soil in json.loads(found.read_text())["soils"]} == {shown(log.name) for log in logs}
+    for log in logs:
+        check_page(page, shown(log.name))
     assert tomllib.loads(model.read_text(encoding="utf-8"))["dbc"]["input"] == ["tractor.dbc"]
     pytest.importorskip("pyarrow")
-    manifest, bad = tmp_path / "fleet.csv", tmp_path / f"{name} bad.log"
-    bad.write_text("no log at all\n")
+    manifest = folder / "fleet.csv"
+    bad = [folder / f"{log.stem} bad.log" for log in logs]
     with manifest.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(("log", "vehicle"))
-        rows.writerow((log.name, name if name.isprintable() else "=T7<b>"))
-        rows.writerow((bad.name, "=T7<b>"))
-    code, out, _ = says("batch", "--config", "tractor", *SHORT, manifest, "--out", tmp_path / f"{name} out")
+        rows.writerow((logs[0].name, UNTIDY[0]))
+        for each in bad:
+            each.write_text("no log at all\n")
+            rows.writerow((each.name, "=T7<b>"))
+    code, out, _ = says("batch", "--config", "tractor", *SHORT, manifest, "--out", folder / f"{bad[0].stem} out")
     assert code == 0
-    assert sum("not a CAN log" in line for line in out.splitlines()) == 1
-    assert shown(bad.name) in out
+    assert sum("not a CAN log" in line for line in out.splitlines()) == len(bad)
+    assert all(shown(each.name) in out for each in bad)
     with manifest.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows((("log", "vehicle"), (log.name, "a\x1b[31m\nFORGED")))
-    code, _, err = says("batch", "--config", "tractor", *SHORT, manifest, "--out", tmp_path / "out")
+        csv.writer(file).writerows((("log", "vehicle"), (logs[0].name, "a\x1b[31m\nFORGED")))
+    code, _, err = says("batch", "--config", "tractor", *SHORT, manifest, "--out", folder / "out")
     assert (code, err.count("\n")) == (1, 1)
+    is_missing(says("batch", "--config", "tractor", folder / f"{NO_UTF8}.log", "--out", folder / NO_UTF8))
+
+
+def is_missing(said: tuple[int, str, str]) -> None:
+    """A command said in one line, or after its usage, what is not there."""
+    code, _, err = said
+    assert code in (1, 2)
+    assert err.splitlines()[-1].startswith("soilbus")
+    assert code == 2 or err.count("\n") == 1
 
 
 @each_of(*UNTIDY, NO_UTF8)
@@ -191,7 +203,7 @@ def test_a_diagnosis_and_a_batch_show_names_as_text(name, drive, tmp_path, says)
     [
         "check --config FILE.toml", "check --config tractor --log FILE.log", "replay --config tractor FILE.log",
         "replay --config tractor FILE.csv", "diagnose --config tractor FILE.log", "watch FILE.log --json",
-        "init --dbc FILE.dbc", "batch --config tractor FILE.log --out FILE", "run --config FILE.toml",
+        "init --dbc FILE.dbc", "run --config FILE.toml",
         "simulate --manoeuvre FILE.json --log FILE.log", "simulate --log FILE/no.log", "watch FILE.log extra FILE",
         "docs FILE", "effects FILE", "simulate --soil FILE --log x.log", "simulate --effect FILE=1 --log x.log",
         "check --config tractor --set FILE=1", "watch --json --channel FILE", "replay --config tractor FILE.log --FILE",
@@ -202,10 +214,7 @@ def test_a_diagnosis_and_a_batch_show_names_as_text(name, drive, tmp_path, says)
 def test_what_is_not_there_is_one_printable_line(words, name, tmp_path, monkeypatch, says):
     monkeypatch.chdir(tmp_path)
     named = name.replace("/", "_").lstrip("-")
-    code, _, err = says(*(word.replace("FILE", named) for word in words.split()))
-    assert code in (1, 2)
-    assert err.splitlines()[-1].startswith("soilbus")
-    assert code == 2 or err.count("\n") == 1
+    is_missing(says(*(word.replace("FILE", named) for word in words.split())))
 
 
 DBC = """VERSION ""

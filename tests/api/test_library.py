@@ -317,10 +317,10 @@ def test_a_found_effect_closes_the_gap_of_another_drive(tmp_path):
     assert record["effects"][0]["probability"] == found.effects["slip_sinkage"]
     assert found.report().startswith("named: ")
     found.write_model(tmp_path / "with.toml")
-    after = soilbus.diagnose(second, tmp_path / "with.toml")
+    after = soilbus.diagnose(second, soilbus.load_config(tmp_path / "with.toml"))
     assert (after.verdict, after.effects) == ("none", {})
     with pytest.raises(ValueError, match="give the path of the TOML file"):
-        soilbus.diagnose(second, soilbus.load_config(tmp_path / "with.toml")).write_model(tmp_path / "no.toml")
+        after.write_model(tmp_path / "no.toml")
 
 
 def test_simulated_drives_are_the_same_for_the_same_seed():

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cantools.database.can import Database, Message
+from cantools.database.can import Database
 
 from soilbus.config.file import parse_config
 from soilbus.config.model import Config
@@ -38,11 +38,6 @@ def frames_of(path: str | Path) -> Iterator[tuple[float, int, bool, bytes]]:
             stamp, _, frame = line.split()
             identifier, _, data = frame.partition("#")
             yield float(stamp[1:-1]), int(identifier, 16), len(identifier) == 8, bytes.fromhex(data)
-
-
-def wanted_signals(message: Message) -> list[str]:
-    """The signals that a configuration of the field vehicle maps."""
-    return [s.name for s in message.signals if s.name not in ("State", "GroundBasedMachineDistance")]
 
 
 def field_config() -> Config:

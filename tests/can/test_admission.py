@@ -385,7 +385,7 @@ def passes(filters: list[dict[str, Any]], identifier: int, extended: bool) -> bo
     return any(f["extended"] == extended and identifier & f["can_mask"] == f["can_id"] & f["can_mask"] for f in filters)
 
 
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(derandomize=True, max_examples=100, deadline=None)
 @given(st.data())
 def test_filters_pass_exactly_what_is_filed(data: st.DataObject) -> None:
     a = admission(LEFT, ("GroundSpeed", "Speed"), ("Exact", "Value"))

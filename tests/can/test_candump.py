@@ -57,7 +57,7 @@ def peer(text: str) -> tuple[list[Frame], type[Exception] | None, str]:
     return found[0], ValueError, "its lines have no time stamps: record with candump -L, or candump -ta"
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(plain_lines | any_lines | odd_lines, max_size=20))
 @example(["(1.0) c#n 123#00\n", "(1.0) c(n 123#00\n", "(1.0) can) 123#00\n"])
 @example(["(1.0) c#n 123#00\n"])
@@ -66,7 +66,7 @@ def test_frames_equal_those_of_python_can(lines: list[str]) -> None:
     assert outcome(candump_frames(lines)) == peer("".join(lines))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(plain_lines | garbage, max_size=10), st.booleans())
 @example([PLAIN, "can0 12A#00\n", PLAIN], False)
 @example([PLAIN, "\n", "(1) can0 12\n", "c1c 012# 1#00\n"], False)

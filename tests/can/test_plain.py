@@ -95,7 +95,7 @@ def cases(draw: st.DrawFn) -> tuple[list[Signal], list[Channel]]:
     return signals, channels
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(cases(), st.data())
 def test_samples_equal_those_judged_one_channel_at_a_time(
     case: tuple[list[Signal], list[Channel]], data: st.DataObject

@@ -32,7 +32,7 @@ def saturates(signal):
     return "Saturates" in signal.dbc.attributes
 
 
-@settings(derandomize=True, deadline=None, max_examples=400)
+@settings(derandomize=True, deadline=None, max_examples=150)
 @given(st.data())
 def test_every_value_comes_back_within_resolution_or_as_a_code(data):
     message, signal = data.draw(st.sampled_from(SENT))

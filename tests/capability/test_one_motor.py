@@ -101,7 +101,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    ("case", "soil"), [*((case, "loam") for case in CASES), ("rear driven", "sandy_loam_11_michigan")]
+    ("case", "soil"), [(case, "sandy_loam_11_michigan" if case == "rear driven" else "loam") for case in CASES]
 )
 def test_the_largest_draft_is_that_of_brute_force(case, soil):
     driven, axles = CASES[case]

@@ -25,7 +25,8 @@ HEAVIER = 1.3
 
 
 def rear_driven(mass: float, std: float):
-    return reference_configuration([f"vehicle.mass.value={mass}", f"vehicle.mass.std={std}"], REFERENCES["tractor-2wd"])
+    settings = [f"vehicle.mass.value={mass}", f"vehicle.mass.std={std}", "estimator.hop=3.0"]
+    return reference_configuration(settings, REFERENCES["tractor-2wd"])
 
 
 @pytest.fixture(scope="module")

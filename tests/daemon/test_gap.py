@@ -15,7 +15,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
-SECONDS = 90.0
+SECONDS = 75.0
 LIMIT = 0.02
 """Share [1] of the pull above which its error is a gap: the driven slope is missing."""
 MINUTE = 60.0

@@ -30,6 +30,8 @@ FULL_BUS = 28.0
 """Seconds for which nothing of ours may find room on a bus that is full."""
 AT_LEAST = 4.0
 """Seconds beyond these and systemd's patience within which what hangs is restarted."""
+LONG = 60.0
+"""Seconds by which all that hangs was restarted: more than FULL_BUS, AT_LEAST and systemd's patience together."""
 SEVERAL = 3
 """Windows in a row that fail by a defect before the service reports a fault: one may be of bad luck."""
 
@@ -107,7 +109,7 @@ def test_a_good_service_is_left_alone(moments):
 
 def test_silence_is_no_reason_to_restart(moments):
     bench = WatchedBench(moments, 5.0)
-    began = bench.run(120.0)
+    began = bench.run(LONG)
     assert not bench.systemd.would_restart(began)
     assert bench.systemd.texts[-1].startswith("listening: no_frames")
 
@@ -119,7 +121,7 @@ def test_nor_is_a_bus_that_is_down(moments, at_start):
     began = bench.run(5.0)
     bench.away = True
     bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
-    bench.run(120.0)
+    bench.run(LONG)
     assert not bench.systemd.would_restart(began)
     assert bench.systemd.texts[-1].startswith("waiting: bus_down")
 
@@ -128,7 +130,7 @@ def test_nor_is_a_bus_on_which_nobody_else_is(moments, caplog):
     """Without anybody to acknowledge them, our frames fill the queue."""
     bench = WatchedBench([])
     bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
-    began = bench.run(120.0)
+    began = bench.run(LONG)
     assert bench.service.bus.counts.sent == 0
     assert not bench.systemd.would_restart(began)
 

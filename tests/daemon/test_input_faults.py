@@ -36,8 +36,8 @@ FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 START = 1_700_000_000.0
 FAULT = START + 11.0
 FROM_THE_START = START - 1.0
-LENGTH, BORDER, AFTER_STEP = 18.2, 16.2, 23.7
-"""Seconds of a recording; of one that at first looks like another soil; of one whose clock is set at the fault."""
+LENGTH, BORDER = 18.2, 16.2
+"""Seconds of a recording; of one that at first looks like another soil."""
 HOP = "estimator.hop=2.0"
 NOTICED = 2.5
 """Seconds after which a fault must have been noticed."""
@@ -167,8 +167,10 @@ FAULTS = {
     "nothing": Fault(le.both(), GOOD, "none"),
     # silent from the start, and from a moment on
     **{
-        f"{m} deleted": Fault(le.cut(m), frozenset({Status.INVALID}), f"input_missing {names}", since=FROM_THE_START)
-        for m, names in STREAMS.items()
+        f"{m} deleted": Fault(
+            le.cut(m), frozenset({Status.INVALID}), f"input_missing {STREAMS[m]}", since=FROM_THE_START
+        )
+        for m in ("AxleLoads", RADAR)
     },
     **{f"{m} cut": Fault(le.cut(m), BAD, f"input_stale {names}") for m, names in STREAMS.items()},
     "RideHeight deleted": Fault(le.cut("RideHeight"), GOOD, "none", since=FROM_THE_START),
@@ -255,11 +257,9 @@ FAULTS = {
     "load error": Fault(le.codes(0xFE00, LOADS[0]), BAD, "input_stale load.FL", "error"),
     "ground speed reserved": Fault(le.codes(0xFB80, GROUND), BAD, "input_stale ground_speed", "reserved"),
     "sinkage out of reason": Fault(le.codes(0x7FF0, SINKS[0]), GOOD, "none", "implausible"),
-    # stammering senders, clocks that are set
+    # stammering senders
     "duplicated": Fault(le.duplicated, GOOD, "none", "duplicate"),
     "reordered": Fault(le.reordered, GOOD, "none"),
-    "clock 1 h ahead": Fault(le.clock_set(3600.0), GOOD, "none", length=AFTER_STEP),
-    "clock 1 h back": Fault(le.clock_set(-3600.0), GOOD, "none", length=AFTER_STEP),
 }  # fmt: skip
 
 

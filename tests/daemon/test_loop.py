@@ -31,24 +31,28 @@ def recording() -> list[can.Message]:
     return drive_messages(reference_configuration(), DURATION)
 
 
-def test_frames_go_out_at_their_cycle_times(recording):
+@pytest.fixture(scope="module")
+def good(recording) -> Bench:
+    """The service after a good drive."""
     bench = Bench(recording)
     bench.run(DURATION)
+    return bench
+
+
+def test_frames_go_out_at_their_cycle_times(good):
     fast = dict.fromkeys(("WheelSlip", "Traversability", "TorqueDemand", "DemandForecast"), 0.1)
     for name, cycle in (fast | {"SoilbusStatus": 1.0}).items():
-        times = [f["at"] for f in bench.sent(name)]
+        times = [f["at"] for f in good.sent(name)]
         gaps = [b - a for a, b in itertools.pairwise(times)]
         assert len(times) >= DURATION / cycle - 2, name
         assert max(gaps) < 1.5 * cycle, name
         assert sum(gaps) / len(gaps) == pytest.approx(cycle, rel=0.05), name
-    assert len(bench.results) == len(bench.sent("SoilStrength")) >= 6
+    assert len(good.results) == len(good.sent("SoilStrength")) >= 6
 
 
-def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves_the_worker_alone(recording):
-    bench = Bench(recording)
-    bench.run(DURATION)
-    beats = [f["at"] + bench.wire.offset for f in bench.sent("WheelSlip")]
-    for end in (result.t for result in bench.results[1:]):
+def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves_the_worker_alone(good):
+    beats = [f["at"] + good.wire.offset for f in good.sent("WheelSlip")]
+    for end in (result.t for result in good.results[1:]):
         assert 0.005 < end - max(beat for beat in beats if beat < end) < 0.03
         assert min(beat for beat in beats if beat > end) - end > 0.08
 
@@ -81,33 +85,27 @@ def test_a_window_that_the_bus_can_end_waits_for_no_frame_and_says_the_same(reco
     assert min(late[0]) > max(late[1])
 
 
-def test_a_good_drive_passes_the_states_in_order_and_ends_in_go(recording):
-    bench = Bench(recording)
-    bench.run(DURATION)
-    states = [str(f["State"]) for f in bench.sent("SoilbusStatus")]
+def test_a_good_drive_passes_the_states_in_order_and_ends_in_go(good):
+    states = [str(f["State"]) for f in good.sent("SoilbusStatus")]
     order = list(dict.fromkeys(states))
     assert order[-1] == "valid"
     assert order[: order.index("valid")] in (["degraded", "estimating"], ["estimating"], ["listening", "estimating"])
-    ways = {str(f["State"]) for f in bench.sent("Traversability", since=bench.clock.now - 2.0)}
+    ways = {str(f["State"]) for f in good.sent("Traversability", since=good.clock.now - 2.0)}
     assert ways == {"go"}
-    before_first = [f for f in bench.sent("Traversability") if f["at"] < bench.sent("SoilStrength")[0]["at"]]
+    before_first = [f for f in good.sent("Traversability") if f["at"] < good.sent("SoilStrength")[0]["at"]]
     assert {str(f["State"]) for f in before_first} == {"unknown"}
 
 
-def test_values_on_the_bus_are_those_of_the_result(recording):
-    bench = Bench(recording)
-    bench.run(DURATION)
-    for result, frame in zip(bench.results, bench.sent("SoilStrength"), strict=True):
+def test_values_on_the_bus_are_those_of_the_result(good):
+    for result, frame in zip(good.results, good.sent("SoilStrength"), strict=True):
         assert frame["Window"] == result.index % 251
         assert frame["BearingPressure"] == pytest.approx(result.bearing.value / 1e3, abs=0.026)
         assert str(frame["Status"]) == str(result.status)
 
 
-def test_the_soil_class_on_the_bus_is_the_likeliest_of_the_result(recording):
-    bench = Bench(recording)
-    bench.run(DURATION)
-    sent = bench.sent("SoilClass")
-    for result, frame in zip(bench.results, sent, strict=True):
+def test_the_soil_class_on_the_bus_is_the_likeliest_of_the_result(good):
+    sent = good.sent("SoilClass")
+    for result, frame in zip(good.results, sent, strict=True):
         share = result.soil_class
         assert share[str(frame["Kind"])] == max(share.values()) == pytest.approx(frame["Probability"], abs=1.26e-4)
         assert frame["UnknownProbability"] == pytest.approx(share["unknown"], abs=1.26e-4)
@@ -117,11 +115,9 @@ def test_the_soil_class_on_the_bus_is_the_likeliest_of_the_result(recording):
     assert (nothing["Kind"], nothing["Probability"], nothing["UnknownProbability"]) == (None, None, None)
 
 
-def test_advice_limits_and_forecast_are_those_of_the_result(recording):
-    bench = Bench(recording)
-    bench.run(DURATION)
+def test_advice_limits_and_forecast_are_those_of_the_result(good):
     for result, advice, limits in zip(
-        bench.results, bench.sent("TractionAdvice"), bench.sent("TractionLimits"), strict=True
+        good.results, good.sent("TractionAdvice"), good.sent("TractionLimits"), strict=True
     ):
         able = result.traversability.capability
         for axle, name in (("front", "Front"), ("rear", "Rear")):
@@ -135,8 +131,8 @@ def test_advice_limits_and_forecast_are_those_of_the_result(recording):
         assert str(limits["LimitingCause"]) == result.traversability.limit
         assert advice["Window"] == limits["Window"] == result.index % 251
         assert str(advice["Status"]) == str(limits["Status"]) == str(result.status)
-    known = [f for f in bench.sent("DemandForecast") if f["Window"] != "not_available"]
-    by_window = {result.index: result.traversability.capability.forecast for result in bench.results}
+    known = [f for f in good.sent("DemandForecast") if f["Window"] != "not_available"]
+    by_window = {result.index: result.traversability.capability.forecast for result in good.results}
     assert {int(f["Window"]) for f in known} == set(by_window)
     for frame in known:
         forecast = by_window[int(frame["Window"])]

@@ -163,10 +163,3 @@ def test_frames_of_soilbus_in_the_recording_are_not_taken_for_another_sender(pla
     again = by_name(list(sent_frames(reference_configuration(), [tmp_path / "mixed.log"])))
     assert {values["ForeignFrames"] for _, values in again["BusHealth"]} == {0}
     assert "go" in {str(values["State"]) for _, values in again["Traversability"]}
-
-
-def test_a_log_of_an_unknown_format_is_one_line(place, tmp_path, capsys):
-    out = tmp_path / "out.nonsense"
-    assert main(["replay", "--config", str(TRACTOR), str(place / "drive.log"), "--frames", str(out)]) == 1
-    assert "out.nonsense" in capsys.readouterr().err.splitlines()[-1]
-    assert list(tmp_path.iterdir()) == []

@@ -22,7 +22,7 @@ from tests.lab.driven_windows import tasks
 
 STILL, LEANING, ROCKING = Swing(0.0, 1e-9), Swing(-0.3, 0.3), Swing(-0.3, 0.3, 0.2, 0.4)
 SLIPS = (0.05, 0.1, 0.2, 0.35)
-DRIVES = 16
+DRIVES = 10
 Z_REF, B_REF = 0.02, 0.3
 CHANCE = 1e-3
 """Probability that a figure just on its target fails here."""
@@ -106,7 +106,7 @@ def largest_draft(soil):
 @pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "dry_sand"])
 def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
     narrower = []
-    for seed in range(1, 7):
+    for seed in range(1, 4):
         short = said(soil, driven_windows.EXCITED, STILL, sinkage=False, seconds=5.0, seed=seed)
         assert short.status is Status.NOT_EXCITED
         assert "load_range" in short.reason.split()

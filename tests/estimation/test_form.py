@@ -42,16 +42,16 @@ def off_and_std(result, soil):
 def test_intervals_hold_the_truth_whatever_the_form_of_the_contact():
     rng = np.random.default_rng(2)
     inside = {config: [] for config in ("with", "without")}
-    for i in range(36):
+    for i in range(24):
         soil = soil_named(KINDS[i % len(KINDS)])
         contact = Contact(rng.uniform(0.18, 0.5), rng.uniform(0.0, 0.32), rng.uniform(0.0, 0.17), bool(i % 2))
         task = window_on(soil, contact, rng)
-        for name, config in (("with", CONFIG), ("without", FORMLESS)):
+        for name, config in (("with", CONFIG), ("without", FORMLESS))[: 1 if i % 3 else 2]:
             result = WindowEstimator(config).solve(task)
             if result.posterior is not None:
                 off, std = off_and_std(result, soil)
                 inside[name].append(np.abs(off) < 1.96 * std)
-    assert len(inside["with"]) >= 30
+    assert len(inside["with"]) >= 20
     assert (np.mean(inside["with"], axis=0) >= 0.88).all()
     assert np.mean(inside["without"], axis=0)[0] < np.mean(inside["with"], axis=0)[0] - 0.4
 
@@ -59,14 +59,14 @@ def test_intervals_hold_the_truth_whatever_the_form_of_the_contact():
 def test_without_sinkage_sensors_intervals_hold_the_pressure_whatever_the_form_of_the_contact():
     rng = np.random.default_rng(4)
     found = []
-    for i in range(72):
+    for i in range(24):
         soil = soil_named(KINDS[i % len(KINDS)])
         contact = Contact(rng.uniform(0.18, 0.5), rng.uniform(0.0, 0.32), rng.uniform(0.0, 0.17), bool(i % 2))
         result = WindowEstimator(CONFIG).solve(window_on(soil, contact, rng, sinkage=False))
         found.append((*off_and_std(result, soil), result.status is Status.VALID))
     off, std, valid = (np.array(column) for column in zip(*found, strict=True))
     inside = np.abs(off[:, 0]) < 1.96 * std[:, 0]
-    assert valid.sum() >= 36
+    assert valid.sum() >= 12
     assert inside.mean() >= 0.93
     assert inside[valid].mean() >= 0.93
     assert abs(np.median(off[:, 0] / std[:, 0])) < 0.5  # forms of the literature shift it one way: the mean follows

@@ -21,7 +21,7 @@ UNLIMITED = reference_configuration(["estimator.search_rate=1e9", "estimator.sea
 
 @pytest.fixture(scope="module")
 def drive():
-    return list(tasks(CONFIG, excited("loam", 60.0), seed=3))
+    return list(tasks(CONFIG, excited("loam", 48.0), seed=3))
 
 
 def with_draft(task, sign):

@@ -37,7 +37,6 @@ __all__ = [
     "task_of",
     "tasks",
     "tracker_of",
-    "two_wheels",
     "windows",
 ]
 
@@ -56,11 +55,6 @@ def c_and_K_known(soil: str) -> list[str]:
     """Settings by which c and K of a soil are known to 25 %."""
     values = {name: getattr(SOILS[soil], name) for name in ("c", "K")}
     return [f"soil.{name}.{key}={v * f}" for name, v in values.items() for key, f in (("value", 1.0), ("std", 0.25))]
-
-
-def two_wheels(config: Config) -> Config:
-    """The vehicle with one wheel in front and one behind."""
-    return config.model_copy(update={"wheel": config.wheel[::2]})
 
 
 def observed_window(

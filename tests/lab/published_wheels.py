@@ -28,9 +28,6 @@ RIGS = Path(__file__).with_name("rigs")
 LUG = 0.01
 """Height of the lugs [m] of the two rigs that had both wheels."""
 
-ERRORS = (1.0, 2.0)
-"""Assumed errors in units of those in rigs/*.toml: a finding should outlive twice the error."""
-
 
 @dataclass(frozen=True)
 class Case:

@@ -130,6 +130,7 @@ class Field(NamedTuple):
         return max(self.value + (step if factor > 1.0 else -step), 0)
 
 
+@cache
 def meanings(module: Any) -> Mapping[tuple[str, str], str]:
     """Docstrings of the fields of a module's classes, by class and field."""
     found = {}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 import signal
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +31,10 @@ OF_FRAMES = {"demand", "bus", "bad_frames", "second_sender", "fault", "text"}
 
 
 def lines_of(*arguments: object) -> list[dict[str, Any]]:
-    done = subprocess.run([*WATCH, *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        code = main(["watch", "--json", *map(str, arguments)])
+    assert (code, err.getvalue()) == (0, "")
+    return [json.loads(line) for line in out.getvalue().splitlines()]
 
 
 def keys_of(record: Any, path: str = "") -> set[str]:

@@ -10,7 +10,7 @@ import pytest
 from soilbus.decision.traversability import State
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.posterior import NORMAL_95
-from soilbus.simulator.reference import REFERENCES, reference_configuration
+from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
@@ -94,11 +94,3 @@ def test_what_the_service_does_not_call_valid_is_never_called_go():
     sure, unsure = (trial(Task(c, 5)) for c in (CONFIG, CONFIG.model_copy(update={"estimator": strict})))
     assert (sure.state, unsure.state) == (State.GO, State.CAUTION)
     assert sure.probability == unsure.probability > 0.95
-
-
-def test_where_mean_moduli_would_leave_nothing_for_k_phi_the_soil_stays_finite():
-    """On this drive the mean of log k_c along n alone is all of the pressure: log k_phi had an sd of 1300."""
-    config = reference_configuration(path=REFERENCES["tractor-2wd"])
-    with np.errstate(over="raise"):
-        call = trial(Task(config, 1498449475))
-    assert 0.0 <= call.probability <= 1.0

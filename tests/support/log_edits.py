@@ -325,11 +325,6 @@ def joined_by(message: str, extra: int) -> Edit:
     return lambda log, t: log.changed(message, lambda s: edit(s, t))
 
 
-def clock_set(by: float) -> Edit:
-    """All stamps jump."""
-    return every_frame(lambda s, t: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))
-
-
 def both(*edits: Edit) -> Edit:
     """One after the other."""
 

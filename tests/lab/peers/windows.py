@@ -9,12 +9,10 @@ from functools import cache, cached_property
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.assembly import model_of, rig_of
-from soilbus.estimation.linearisation import Linearisation
+from soilbus.estimation.assembly import model_of
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import ESTIMATOR, HELD, SolverOptions
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.window import Rig
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -71,12 +69,6 @@ def configured_prior() -> dict[str, tuple[float, float]]:
 
 
 @cache
-def reference_rig() -> Rig:
-    """Our reference tractor, with a sinkage sensor at each wheel."""
-    return rig_of(reference_configuration())
-
-
-@cache
 def fit_model() -> WheelModel:
     """The wheel model that all methods but the linear one integrate."""
     return model_of(reference_configuration())
@@ -104,24 +96,6 @@ def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
 def entry_angles(problem: ObservationModel) -> Array:
     """Entry angles [rad] (N, W) from the sinkage sensors (eq. 1)."""
     return np.arccos(1.0 - np.maximum(problem.sinkage, 1e-4) / problem.rig.radius)
-
-
-def at_measured(problem: ObservationModel, soil: Soil) -> Linearisation:
-    """Our residuals at a soil, with loads and speeds at their measured values."""
-    return problem.linearise(soil, np.zeros(len(problem.gain_std)), problem.start(soil))
-
-
-def reading_covariance(problem: ObservationModel, at: Linearisation) -> Array:
-    """Covariance (N, m, m) of an instant's torques, draft balance and sinkages against the model.
-
-    The noise of loads and speeds travels through the linearised model: the noise model of
-    soilbus.estimation, without the gain errors, written out.
-    """
-    latent = np.concatenate([problem.load_var, problem.speed_var, problem.ground_speed_var[:, None]], axis=1)
-    covariance = np.einsum("nik,nk,njk->nij", at.by_latents, latent, at.by_latents)
-    own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
-    np.einsum("nww->nw", covariance)[:] += own
-    return np.asarray(covariance)
 
 
 def bearing_pressure(K_L: float, n: float, std: float = np.nan) -> Estimate:
