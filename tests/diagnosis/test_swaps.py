@@ -33,7 +33,11 @@ class Recordings:
             names=names,
             score=value,
             neg2_log_posterior=value,
-            blocks=SimpleNamespace(neg2_log=np.full(BLOCKS, value / BLOCKS)),
+            blocks=SimpleNamespace(
+                neg2_log=np.full(BLOCKS, value / BLOCKS),
+                rows=np.full(BLOCKS, ROWS / BLOCKS),
+                chi2=np.full(BLOCKS, 2.0 * ROWS / BLOCKS),  # a gap beyond noise
+            ),
             free_unheld=(),
             as_starts=lambda effects=None: (),
         )
