@@ -48,7 +48,7 @@ def test_nothing_is_missing_where_loads_shake():
     assert np.mean([f.gap_before.value for f in found]) == pytest.approx(1.0, abs=0.02)
 
 
-@pytest.mark.xfail(strict=True, reason="standing parts take some: 0.056 s in place of 0.04 s")
+@pytest.mark.xfail(strict=True, reason="0.056 s in place of 0.04 s; the cause is not found")
 def test_the_total_delay_of_a_torque_is_within_its_error():
     reported = diagnosed(503, "torque", 0.04).completed.parameters()["torque_lag"]
     assert abs(reported["total"].value - 0.04) < 2.0 * reported["total"].std < 0.02

@@ -39,7 +39,7 @@ LOSS, MORE_LOSS, PUSH = (
 )
 
 
-UNSEEN = pytest.mark.xfail(strict=True, reason="a loss of 2.2 % on dry sand is not seen: the soil imitates it")
+UNSEEN = pytest.mark.xfail(strict=True, reason="priors of gains show the loss, predictions of blocks do not")
 
 
 def recorded(scenario: Scenario, seed: int, *effects: Active) -> Record:

@@ -60,7 +60,7 @@ def test_where_nothing_is_missing_nothing_is_named(kind):
         assert (trial.verdict, trial.named) == ("none", ()), case.id
 
 
-@pytest.mark.xfail(strict=True, reason="a torque ripple of this size is noise by the recording's own floor")
+@pytest.mark.xfail(strict=True, reason="a torque ripple leaves a gap of 1.014, which is within noise")
 def test_what_the_catalogue_lacks_is_unknown():
     trial = tried(the_case("outside/outside:torque_ripple/medium/"))
     assert trial.verdict == "unknown"

@@ -164,7 +164,7 @@ def _posterior(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel,
         estimate_of(tau, tau_cell, options.error_of_parts),
         estimate_of(total, sum_cell, options.error_of_sum),
         (float(ridge.total[best] - ridge.tau[best]), float(ridge.tau[best])),
-        (cost(*here) - float(ridge.cost[best])),
+        cost(*here) - float(ridge.cost[best]),
     )
 
 

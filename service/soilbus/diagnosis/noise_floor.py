@@ -46,7 +46,7 @@ def noise_factors(records: Sequence[Record], fitted: FittedModel) -> dict[str, f
                 of_noise = (expected[first] + expected[next_])[known]
                 found = np.array([float(change @ change), float(of_noise.sum()), len(first)])
                 squares[kind] = squares.get(kind, np.zeros(3)) + found
-    least = records[0].options.least_noise_share
+    least = records[0].training.options.variance.least_share
     return {
         kind: float(found / noise)
         for kind, (found, noise, n) in squares.items()

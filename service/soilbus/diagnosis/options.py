@@ -26,10 +26,8 @@ class DiagnosisOptions:
     """Instants that each part of a recording must have, and residuals of a channel or region that is judged.  With 4
     and 24 instants, and with 20 residuals, no value of the golden diagnoses moves."""
 
-    least_noise_share: float = 0.02
-    """Share of its own noise [1] an instant that corrections of a kind must show for its noise floor to be found."""
     noise_rounds: int = 2
-    """Fits after which noise floors are found anew, as those of kinds that share residuals hang on each other."""
+    """Fits [1] after which noise floors are found anew: each kind's depends on those of the others in its residuals."""
 
     max_effects: int = 3
     """Effects that are added at most, and residual terms of a channel.  With 4 no value of the golden diagnoses moves,
