@@ -1,11 +1,11 @@
-"""Frames that the kernel has no room for yet: the newest of each identifier, and none for long."""
+"""Queue of frames that the kernel has no room for yet: the newest of each identifier, dropped when late."""
 
 from __future__ import annotations
 
 from soilbus.can.publish import Frame
 
 LATE = 0.1
-"""Age [s] at which a frame that did not get out is dropped: its successor says more, or silence does."""
+"""Age [s] at which a frame that did not get out is dropped: its successor is newer."""
 
 
 class Outbox:

@@ -1,7 +1,7 @@
 """Configuration -> a service that is ready to run.
 
 Bus, filters, publisher and intake are made here; the worker thread loads what only it needs (estimator, stored state)
-while the loop listens already, then solves a few made-up windows, so that the first real one is not slow.
+while the loop listens already.  It then solves a few made-up windows, so that the first real one is fast.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def start_service(
 
 
 def _claim(config: Config, ours: Database) -> AddressClaim | None:
-    """What [j1939] asks for, of the address that our frames have."""
+    """Return the address claim that [j1939] asks for, with the address of our frames."""
     if not config.j1939.address_claim:
         return None
     from soilbus.daemon.address_claim import AddressClaim

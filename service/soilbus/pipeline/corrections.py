@@ -61,4 +61,4 @@ class Corrections:
 
 
 NO_CORRECTIONS = Corrections()
-"""Before the first window."""
+"""The corrections before the first window: none."""
