@@ -1,4 +1,4 @@
-"""How well a model predicts each block of a recording from all others.
+"""How well a model predicts each block of a recording, and each sensor's gain, from all others.
 
     s_b = -2 log p(r_b | all other blocks) = r' (I + J P_-b J')^-1 r + log det(I + H_b P_-b)
 
@@ -6,6 +6,9 @@ r and J are the block's residuals and Jacobian, whitened, at the optimum by the 
 covariance of soil, gains and effects by these, H_b = J'J.  With the quadratic model about the fit nothing is fitted
 again (leave-one-out by one fit: Beirami et al. 2017, NeurIPS 30; blocks, as instants follow each other: Burman, Chow &
 Nolan 1994, Biometrika 81:351).
+
+What is known of a sensor's gain is a block of one residual.  An effect that is missing bends gains where the soil
+cannot imitate it, and then blocks are predicted well by a gain that no such sensor has.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.linearisation import RESIDUAL, Linearisation
+
+SHARE_LEFT_OUT = 0.99
+"""Share [1] of a gain's prior that is left out: what the data do not determine keeps ten times its sd."""
 
 
 class BlockScores(NamedTuple):
@@ -58,8 +64,9 @@ def block_scores(
     priors: Sequence[Gaussian],
     modes: Sequence[Gaussian],
     own: NDArray[np.bool_],
+    n_sensors: int,
 ) -> BlockScores:
-    """Return the scores of all blocks of all recordings, in the order of these.
+    """Return the scores of the sensors' gains, and then of all blocks of all recordings, in the order of these.
 
     Parameters
     ----------
@@ -71,6 +78,8 @@ def block_scores(
         Soil and gains of each recording, near which its parts are linearised.
     own : (G,)
         Which gains and parameters each recording has for itself.
+    n_sensors
+        Number of the sensors' gains, the first of all.
     """
     free = np.diag(priors[0].covariance) > 0.0
     is_own, R = (
@@ -81,6 +90,7 @@ def block_scores(
     columns = [np.where(is_own, np.cumsum(is_own) - 1 + i * n, np.cumsum(~is_own) - 1 + R * n) for i in range(R)]
     precision, slope = np.zeros((R * n + shared,) * 2), np.zeros(R * n + shared)
     blocks = [_blocks(parts, mode, free) for parts, mode in zip(records, modes, strict=True)]
+    of_gains = _gain_blocks(priors[0], modes[0], free, n_sensors, R)
     for at, prior, mode, (_, gradient, information, _) in zip(columns, priors, modes, blocks, strict=True):
         of_prior = np.linalg.inv(prior.covariance[np.ix_(free, free)])
         precision[np.ix_(at, at)] += of_prior + information.sum(0)
@@ -88,7 +98,7 @@ def block_scores(
     covariance = np.linalg.inv(precision)
     to_best = -covariance @ slope
     scores = []
-    for at, (chi2, gradient, information, rows) in zip(columns, blocks, strict=True):
+    for at, (chi2, gradient, information, rows) in zip([columns[0], *columns], [of_gains, *blocks], strict=True):
         P = covariance[np.ix_(at, at)]
         chi2, gradient = _moved(chi2, gradient, information, to_best[at])
         left = np.eye(len(P)) - P @ information
@@ -117,6 +127,22 @@ def _blocks(parts: tuple[Part, Part], mode: Gaussian, free: NDArray[np.bool_]) -
             information[b] += normal[1:, 1:]
             rows[b] += part.known[of_part == b].sum()
     return chi2, gradient, information, rows
+
+
+def _gain_blocks(
+    prior: Gaussian, mode: Gaussian, free: NDArray[np.bool_], n_sensors: int, R: int
+) -> tuple[Array, Array, Array, Array]:
+    """Return the same as `_blocks` of the prior of each free gain of a sensor, of which a recording has the R-th part."""
+    first = len(free) - len(prior.gains)
+    gains = np.flatnonzero(free[first : first + n_sensors])
+    at = np.searchsorted(np.flatnonzero(free), first + gains)
+    covariance = prior.covariance[np.ix_(first + gains, first + gains)] / R
+    whitened = SHARE_LEFT_OUT**0.5 * np.linalg.inv(np.linalg.cholesky(covariance))
+    jacobian = np.zeros((len(gains), int(free.sum())))
+    jacobian[:, at] = whitened
+    residual = whitened @ (mode.gains - prior.gains)[gains]
+    rows = np.ones(len(gains))
+    return residual**2, jacobian * residual[:, None], np.einsum("bi,bj->bij", jacobian, jacobian), rows
 
 
 def _steps(soil: Array, gains: Array, mode: Gaussian) -> Array:

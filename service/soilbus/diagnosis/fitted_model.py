@@ -335,9 +335,10 @@ def fit_model(
         _parts(record, record.training.with_effects(effects, free), fit, held_out)
         for record, fit, held_out in zip(records, fits, checks, strict=True)
     ]
-    own = own_gains(records[0].training.n_sensors, effects, free)
+    n_sensors = records[0].training.n_sensors
+    own = own_gains(n_sensors, effects, free)
     with np.errstate(all="ignore"):
-        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own)
+        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own, n_sensors)
     return FittedModel(tuple(effects), free, free_unheld, priors, tuple(fits), tuple(checks), blocks)
 
 
