@@ -34,7 +34,7 @@ def test_each_block_is_predicted_from_all_others_as_by_a_fit_to_these():
     std = np.full(rows.shape[1] - 1, 0.7)
     prior = Gaussian(np.ones(SOIL), np.zeros(2), np.diag(std**2))
     parts = part_of(rows, block, block < 3), part_of(rows, block, block >= 3)
-    found = block_scores([parts], [prior], [prior], np.zeros(2, bool))
+    found = block_scores([parts], [prior], [prior], np.zeros(2, bool), 0)
     for b in range(5):
         J, r = rows[block != b][:, 1:], rows[block != b][:, 0]
         covariance = np.linalg.inv(J.T @ J + np.diag(std**-2.0))
@@ -58,7 +58,7 @@ def test_recordings_share_gains_and_have_a_soil_each():
         [half, half],
         [half, half],
     )
-    found = block_scores(*given, np.zeros(2, bool))
+    found = block_scores(*given, np.zeros(2, bool), 0)
     J = np.zeros((48, 2 * SOIL + 2))
     J[:24, :SOIL], J[24:, SOIL : 2 * SOIL] = one[:, 1 : 1 + SOIL], two[:, 1 : 1 + SOIL]
     J[:, 2 * SOIL :] = np.vstack([one, two])[:, 1 + SOIL :]
@@ -71,13 +71,34 @@ def test_recordings_share_gains_and_have_a_soil_each():
         assert found.chi2[b] == pytest.approx(left @ np.linalg.solve(predicted, left))
 
 
+def test_each_gain_is_predicted_from_the_data_and_the_other_gains():
+    """A hundredth of its prior stays, so that one is determined which no data show."""
+    rng = np.random.default_rng(3)
+    rows, block = linear(rng, 4, 8, 2)
+    precision = np.array([2.0] * SOIL + [5.0, 0.5])
+    prior = Gaussian(np.ones(SOIL), np.array([0.3, -0.2]), np.diag(1.0 / precision))
+    parts = part_of(rows, block, block < 2), part_of(rows, block, block >= 2)
+    found = block_scores([parts], [prior], [prior], np.zeros(2, bool), 2)
+    J, r = rows[:, 1:], rows[:, 0]
+    start = np.append(np.zeros(SOIL), prior.gains)
+    for k, of_prior in enumerate(precision[SOIL:]):
+        weaker = precision.copy()
+        weaker[SOIL + k] *= 0.01
+        covariance = np.linalg.inv(J.T @ J + np.diag(weaker))
+        off = (covariance @ (weaker * start - J.T @ r) - start)[SOIL + k]
+        variance, own = 1.0 / (0.99 * of_prior), covariance[SOIL + k, SOIL + k]
+        assert found.chi2[k] == pytest.approx(off**2 / (variance + own))
+        assert found.neg2_log[k] == pytest.approx(found.chi2[k] + np.log1p(own / variance))
+    assert len(found.rows) == 2 + 4
+
+
 def test_the_score_of_a_single_block_is_its_evidence():
     rng = np.random.default_rng(4)
     rows, block = linear(rng, 1, 20, 1)
     prior = Gaussian(np.ones(SOIL), np.zeros(1), np.diag([0.5] * SOIL + [3.0]))
     first = np.arange(20) < 12
     found = block_scores(
-        [(part_of(rows, block, first), part_of(rows, block, ~first))], [prior], [prior], np.zeros(1, bool)
+        [(part_of(rows, block, first), part_of(rows, block, ~first))], [prior], [prior], np.zeros(1, bool), 0
     )
     covariance = np.eye(20) + rows[:, 1:] @ prior.covariance @ rows[:, 1:].T
     evidence = rows[:, 0] @ np.linalg.solve(covariance, rows[:, 0]) + np.linalg.slogdet(covariance)[1]
