@@ -132,16 +132,15 @@ def _blocks(parts: tuple[Part, Part], mode: Gaussian, free: NDArray[np.bool_]) -
 def _gain_blocks(
     prior: Gaussian, mode: Gaussian, free: NDArray[np.bool_], n_sensors: int, R: int
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the same as `_blocks` of the prior of each free gain of a sensor, of which a recording has the R-th part."""
+    """Return the same as `_blocks` of the prior of each sensor's gain; a recording has the R-th part of it."""
     first = len(free) - len(prior.gains)
     gains = np.flatnonzero(free[first : first + n_sensors])
     at = np.searchsorted(np.flatnonzero(free), first + gains)
     covariance = prior.covariance[np.ix_(first + gains, first + gains)] / R
+    jacobian, residual, rows = np.zeros((n_sensors, int(free.sum()))), np.zeros(n_sensors), np.zeros(n_sensors)
     whitened = SHARE_LEFT_OUT**0.5 * np.linalg.inv(np.linalg.cholesky(covariance))
-    jacobian = np.zeros((len(gains), int(free.sum())))
-    jacobian[:, at] = whitened
-    residual = whitened @ (mode.gains - prior.gains)[gains]
-    rows = np.ones(len(gains))
+    jacobian[gains[:, None], at], rows[gains] = whitened, 1.0
+    residual[gains] = whitened @ (mode.gains - prior.gains)[gains]
     return residual**2, jacobian * residual[:, None], np.einsum("bi,bj->bij", jacobian, jacobian), rows
 
 
