@@ -28,7 +28,10 @@ SHARE_LEFT_OUT = 0.99
 
 
 class BlockScores(NamedTuple):
-    """Of each block (B,): -2 log predictive likelihood, the chi-square in it, and the number of residuals."""
+    """Of each block (B,): -2 log predictive likelihood, the chi-square in it, and the number of residuals.
+
+    A gain counts in the first alone: it is no residual.
+    """
 
     neg2_log: Array
     chi2: Array
@@ -105,7 +108,7 @@ def block_scores(
         without = np.linalg.solve(left, np.broadcast_to(P, information.shape))
         chi2, gradient = _moved(chi2, gradient, information, np.einsum("bij,bj->bi", without, gradient))
         chi2 = chi2 - np.einsum("bi,ij,bj->b", gradient, P, gradient)
-        scores.append(BlockScores(chi2 - np.linalg.slogdet(left)[1], chi2, rows))
+        scores.append(BlockScores(chi2 - np.linalg.slogdet(left)[1], np.where(rows > 0.0, chi2, 0.0), rows))
     return BlockScores(*(np.concatenate(column) for column in zip(*scores, strict=True)))
 
 
@@ -137,11 +140,11 @@ def _gain_blocks(
     gains = np.flatnonzero(free[first : first + n_sensors])
     at = np.searchsorted(np.flatnonzero(free), first + gains)
     covariance = prior.covariance[np.ix_(first + gains, first + gains)] / R
-    jacobian, residual, rows = np.zeros((n_sensors, int(free.sum()))), np.zeros(n_sensors), np.zeros(n_sensors)
+    jacobian, residual = np.zeros((n_sensors, int(free.sum()))), np.zeros(n_sensors)
     whitened = SHARE_LEFT_OUT**0.5 * np.linalg.inv(np.linalg.cholesky(covariance))
-    jacobian[gains[:, None], at], rows[gains] = whitened, 1.0
+    jacobian[gains[:, None], at] = whitened
     residual[gains] = whitened @ (mode.gains - prior.gains)[gains]
-    return residual**2, jacobian * residual[:, None], np.einsum("bi,bj->bij", jacobian, jacobian), rows
+    return residual**2, jacobian * residual[:, None], np.einsum("bi,bj->bij", jacobian, jacobian), np.zeros(n_sensors)
 
 
 def _steps(soil: Array, gains: Array, mode: Gaussian) -> Array:

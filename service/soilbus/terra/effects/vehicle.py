@@ -44,8 +44,8 @@ DRIVETRAIN_LOSS = Effect(
     ruled_out="a torque cell between gear and wheel reads what reaches the wheel",
 )
 
-SLOPE_KNOTS = 16
-"""One every ten metres of a drive of two minutes: fields undulate over twenty and more."""
+SLOPE_KNOTS = 24
+"""One every seven metres of a drive of two minutes: fields undulate over twenty and more."""
 
 
 def _unmeasured_slope(around: Surroundings, values: Values) -> Any:
