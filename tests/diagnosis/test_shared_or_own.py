@@ -81,7 +81,9 @@ def test_slopes_that_differ_from_field_to_field_are_no_offset(seed):
     assert reported == pytest.approx(slopes, abs=0.006)
 
 
-@pytest.mark.xfail(strict=True, reason="a slope may change along the field, so the same push all along is sooner an offset")
+@pytest.mark.xfail(
+    strict=True, reason="a slope may change along the field, so the same push all along is sooner an offset"
+)
 def test_one_field_does_not_separate_a_slope_from_an_offset():
     records = [field(BLIND, with_effects(BLIND, ["draft_offset=400"]), "loam", 0.0, 5)]
     found = diagnose(records, prior_of(BLIND), list(CATALOGUE.values()))
