@@ -83,27 +83,6 @@ def test_the_prior_factor_is_the_product_of_likelihood_and_prior(name, simulated
     assert min(values) > -0.05  # -2 log prior is zero at its least value
 
 
-def test_the_ridge_of_a_likelihood_factor_is_that_of_one_strength():
-    """At one pressure only p = c + pressure tan phi is known: another mean on the ridge has the same ridge."""
-    prior, pressure, wide = prior_of(reference_configuration()), 4e4, np.diag([1.0, 1.0, 1.0, 0.25, 0.36, 0.25])
-    c, tan = 3e3, 0.5
-
-    def strength(soil):  # derivatives by the logarithms of phi and c, over the strength
-        slope = np.array([pressure * soil[3] * (1.0 + np.tan(soil[3]) ** 2), soil[4]])
-        return slope / (soil[4] + pressure * np.tan(soil[3]))
-
-    soil = np.array([6e3, 8e5, 0.6, np.arctan(tan), c, 0.02])
-    information = np.diag(1.0 / np.diag(wide))
-    information[3:5, 3:5] += np.outer(strength(soil), strength(soil)) / 0.005**2
-    first = Gaussian(soil, np.zeros(0), np.linalg.inv(information))
-    other = soil.copy()
-    other[4], other[3] = 1.5e3, np.arctan(tan + 1.5e3 / pressure)
-    moved = first.relinearised(other, np.zeros(0), prior, 0.3)
-    across, along = strength(other), np.array([strength(other)[1], -strength(other)[0]])
-    assert np.sqrt(across @ moved.covariance[3:5, 3:5] @ across) == pytest.approx(0.005, rel=0.03)
-    assert along @ moved.covariance[3:5, 3:5] @ along > 0.1**2 * (along @ along)
-
-
 def test_without_prior_variance_the_likelihood_factor_is_the_gaussian():
     prior = prior_of(reference_configuration([f"soil.{name}.std=0" for name in ("k_c", "n", "phi", "c")]))
     gaussian = Gaussian.of(prior, np.zeros(0))

@@ -247,7 +247,7 @@ def _fits_at(objective: JointObjective, end: Solution[tuple[Iterate, ...], Joint
         fit = fit_at(part, own)
         if fit is None:
             return None
-        mode = part.gaussian(fit.mode.soil, fit.mode.gains, covariance[columns[:, None], columns], own.previous.soil)
+        mode = part.gaussian(fit.mode.soil, fit.mode.gains, covariance[columns[:, None], columns])
         fits.append(replace(fit, mode=mode))
     penalty = end.model.neg2_log_evidence - sum(model.neg2_log_evidence for model in end.model.parts)
     return [replace(fit, neg2_log_evidence=fit.neg2_log_evidence + penalty / R) for fit in fits]

@@ -148,20 +148,6 @@ class Gaussian:
         off = covariance[:, free] @ (np.log(self.soil[free] / prior.median[free]) / prior.log_std[free] ** 2)
         return replace(self, offset=np.zeros(_SOIL)).shifted(off, covariance)
 
-    def relinearised(self, soil: Array, gains: Array, prior: SoilPrior, width: float) -> Gaussian:
-        """Return the Gaussian about another mean, by the same linear model and prior.
-
-        What compensates for a LINEAR parameter is proportional to the parameter itself, and so more or less of its
-        logarithm; the prior stays that of the logarithm.
-        """
-        free, covariance = self._without_priors(prior)
-        by_deviations, of_soil = np.eye(len(covariance)), np.ix_(prior.free, prior.free)
-        by_deviations[of_soil] = np.linalg.inv(deviations(soil, self.soil, width)[1][of_soil])
-        covariance = by_deviations @ covariance @ by_deviations.T
-        along = covariance[:, free]
-        removed = np.linalg.solve(along[free] + np.diag(prior.log_std[free] ** 2), along.T)
-        return replace(self, soil=soil, gains=gains, covariance=covariance - along @ removed)
-
     def _without_priors(self, prior: SoilPrior) -> tuple[NDArray[np.intp], Array]:
         """Free parameters of LINEAR, and the covariance (6 + G, 6 + G) without the priors of their logarithms."""
         free = LINEAR[prior.log_std[LINEAR] > 0.0]

@@ -24,13 +24,14 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import solve_with_inverse
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.variance_components import block_sums
 from soilbus.terra.wheel import WheelModel
 
 if TYPE_CHECKING:
     from soilbus.estimation.multistart import Fit
-    from soilbus.estimation.solver import Objective
 
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
@@ -126,9 +127,8 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
         The prior itself where every form parameter is held or the normal equations are singular.
     """
     problem, optimum = objective.problem, fit.optimum
-    approximation = objective.approximation_at(optimum)
     free = np.flatnonzero(np.diag(prior.covariance) > 0.0)
-    if approximation is None or not len(free):
+    if not len(free):
         return prior
     by_form, weighed = problem.by_form(optimum)
     by_form, weighed = by_form[:, free], weighed[:, free]
@@ -136,35 +136,34 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
         optimum.soil, optimum.gains, prior.by_form[:, free]
     )
     columns = weighed.T @ optimum.at.rows
-    cross = (columns @ approximation.directions) + prior_by_form.T @ precision @ objective.prior_jacobian(optimum)
+    directions = objective.directions(Iterate.of(optimum))
+    cross = columns @ directions + prior_by_form.T @ precision @ objective.prior_jacobian(optimum)
     gradient = columns[:, 0] + prior_by_form.T @ (precision @ off)
     information = by_form.T @ weighed + prior_by_form.T @ precision @ prior_by_form
     own = solve_with_inverse(prior.covariance[np.ix_(free, free)], prior.mean[free])
     if own is None:
         return prior
-    of_gradient, of_information = approximation.explained(cross)
-    information = information - of_information
-    discount = _discount(objective, fit, by_form, cross, information) * problem.options.posterior.form_discount
+    following = fit.covariance @ cross.T  # minus the derivatives of coordinates and gains by the form
+    information = information - cross @ following
+    of_gradient = cross @ fit.last_step
+    scores = ((by_form - optimum.at.rows @ directions @ following) * optimum.at.weighed[:, :1]).reshape(
+        problem.n, -1, len(free)
+    )
+    discount = _discount(scores.sum(axis=1), information, problem) * problem.options.posterior.form_discount
     found = solve_with_inverse(information / discount + own[1], own[0] + (of_gradient - gradient) / discount)
     if found is None:
         return prior
     sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
-    sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ approximation.covariance @ cross.T
+    sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ following
     mean[free], covariance[np.ix_(free, free)] = found
     return FormPosterior(sensitivity, mean, covariance)
 
 
-def _discount(objective: Objective, fit: Fit, by_form: Array, cross: Array, information: Array) -> float:
-    """Return how much more the scores of seconds vary than the information (P, P) of the form says; 1 at least.
+def _discount(scores: Array, information: Array, problem: ObservationModel) -> float:
+    """Return how much more the scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least.
 
     Scores are those of the form with soil and gains eliminated (covariance by blocks: Newey & West 1987).
     """
-    problem, optimum = objective.problem, fit.optimum
-    approximation = objective.approximation_at(optimum)
-    assert approximation is not None
-    n, m = optimum.at.by_latents.shape[:2]
-    rows = by_form - optimum.at.rows @ approximation.directions @ approximation.covariance @ cross.T
-    scores = (rows * optimum.at.weighed[:, :1]).reshape(n, m, -1).sum(axis=1)
     blocks = block_sums(scores, problem.t, problem.options.variance.block)
     variance = np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0]
     return max(float(np.trace(variance)) / len(information), 1.0)

@@ -46,6 +46,8 @@ class Fit:
     ----------
     mode
         Soil and gains at the minimum, with the inverse of the information as covariance.
+    last_step, covariance
+        H^-1 g and H^-1 at `optimum`, by free coordinates and active gains.
     sinkage : (W,)
         Mean over the window by wheel [m], nan where unknown.
     optimum
@@ -65,6 +67,8 @@ class Fit:
     """
 
     mode: Gaussian
+    last_step: Array
+    covariance: Array
     sinkage: Array
     optimum: Optimum
     neg2_log_posterior: float
@@ -225,7 +229,9 @@ def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluation
     is_converged, previous = end.termination is Termination.STEP, end.previous
     last_decrease = end.predicted_decrease if is_converged else 0.0
     return Fit(
-        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1], previous.soil),
+        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1]),
+        last_step=inverse[0],
+        covariance=inverse[1],
         sinkage=objective.problem.mean_sinkage(end.iterate.as_soil(), end.iterate.gains, end.iterate.latents),
         optimum=Optimum(objective.problem.t, previous.soil, previous.gains, previous.latents, end.model.linearisation),
         neg2_log_posterior=end.model.neg2_log_posterior - last_decrease,

@@ -29,7 +29,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
+from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic
 from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
@@ -123,31 +123,6 @@ class WindowModel(QuadraticModel):
     linearisation: Linearisation
 
 
-class GaussianApproximation(NamedTuple):
-    """A window's linear model at its optimum, with the prior.
-
-    Attributes
-    ----------
-    directions : (1 + 6 + G, F + A)
-        As `Objective.directions`.
-    prior
-        The prior's quadratic there.
-    step : (F + A,)
-        H^-1 g, to be subtracted: leads to the minimum.
-    covariance : (F + A, F + A)
-        H^-1.
-    """
-
-    directions: Array
-    prior: PriorQuadratic
-    step: Array
-    covariance: Array
-
-    def explained(self, mixed: Array) -> tuple[Array, Array]:
-        """Return what soil and gains explain of gradient (K,) and information (K, K) of other unknowns."""
-        return mixed @ self.step, mixed @ self.covariance @ mixed.T
-
-
 def coordinates_of(problem: ObservationModel, prior: SoilPrior) -> Coordinates:
     """Return the coordinates of a window's free parameters."""
     return Coordinates(prior, float(problem.rig.width.mean()), problem.options.search)
@@ -196,7 +171,6 @@ class Objective:
         self._gain_directions[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
         self.prior_factor = PriorFactor(joint_prior, prior, self.active, self.coordinates.width)
         self._prior_cache: tuple[Array, Array, PriorQuadratic] | None = None
-        self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
 
     def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
         """Return the same window under another joint prior."""
@@ -338,31 +312,10 @@ class Objective:
         unknowns = np.concatenate([self.free, _SOIL + self.active])
         return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum.soil)[unknowns])
 
-    # Gaussians at an optimum
-
-    def approximation_at(self, optimum: Optimum) -> GaussianApproximation | None:
-        """Return the linear model at an optimum; None where its information is singular."""
-        if self._approximation is None or self._approximation[0] is not optimum:
-            iterate = Iterate.of(optimum)
-            directions, prior = self.directions(iterate), self.prior_at(iterate)
-            by_unknowns = directions.T @ optimum.at.normal
-            solution = solve_with_inverse(
-                by_unknowns @ directions + prior.information, by_unknowns[:, 0] + prior.gradient
-            )
-            self._approximation = (
-                optimum,
-                None if solution is None else GaussianApproximation(directions, prior, *solution),
-            )
-        return self._approximation[1]
-
-    def gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
-        """Return the Gaussian with this covariance of coordinates and active gains, linearised at `base`."""
-        jacobian = self.parameter_jacobian(soil if base is None else base)
-        logs = jacobian @ covariance @ jacobian.T
-        if base is None:
-            return Gaussian(soil, gains, logs)
-        of_base, prior = Gaussian(base, gains, logs), self.coordinates.prior
-        return of_base.relinearised(soil, gains, prior, self.coordinates.width)
+    def gaussian(self, soil: Array, gains: Array, covariance: Array) -> Gaussian:
+        """Return the Gaussian with this covariance of coordinates and active gains."""
+        jacobian = self.parameter_jacobian(soil)
+        return Gaussian(soil, gains, jacobian @ covariance @ jacobian.T)
 
 
 class Termination(StrEnum):
