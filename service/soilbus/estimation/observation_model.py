@@ -450,14 +450,12 @@ class ObservationModel(Measurements):
         """Entry angles (N, W) [rad] after a step (6,) of the soil and (G,) of the gains, by the linear model.
 
         more_load (N, W) [N] is the change of the latent loads less the part that the change of slip carries.
-        A step changes an angle by a factor within 0.6 and 1.6.
         """
         N, W = self.n, self.n_wheels
         change = more_load + at.load_residual - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
         if len(at.load_by_effects):
             change -= np.tensordot(gain_step[self.layout.effects], at.load_by_effects, 1)
-        low, high = angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)
-        return np.asarray(np.minimum(np.maximum(angle + change / at.load_slope, low), high))
+        return near_angle(angle, change / at.load_slope)
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) clipped to their ranges."""
@@ -581,19 +579,28 @@ class ObservationModel(Measurements):
     def after(self, previous: Optimum) -> Latents:
         """Latents of this window at the optimum of an earlier one: of the instants of both as there, else as measured.
 
-        Parameters
-        ----------
-        previous : Optimum
-            End point of the fit of the earlier window.
+        Entry angles of these follow, to first order, from the earlier instant at which the wheel carried most nearly
+        the same.
         """
-        shared = self._shared(previous.t)
-        new = self.part(slice(shared, None)).start(Soil(*previous.soil.tolist()), gains=previous.gains)
-        return previous.latents.followed_by(shared, new) if shared else new
+        shared, old, at = self._shared(previous.t), previous.latents, previous.at
+        if not shared:
+            return self.start(Soil(*previous.soil.tolist()), gains=previous.gains)
+        load, speed, ground = self.load[shared:], self.speed[shared:], self.ground_speed[shared:]
+        near = np.abs(load[:, None] - old.load).argmin(axis=1), np.arange(self.n_wheels)
+        slip_change = (old.ground_speed[:, None] / old.speed)[near] - ground[:, None] / speed
+        more = load - old.load[near] + at.load_residual[near] - at.load_by_slip[near] * slip_change / self.rig.radius
+        angle = near_angle(old.entry_angle[near], more / at.load_slope[near])
+        return old.followed_by(shared, Latents(load, speed, ground, angle))
 
     def _shared(self, t: Array) -> int:
         """Number of first instants that are the last ones of times t (M,) [s]."""
         n = len(t) - int(np.searchsorted(t, self.t[0] - TIME_TOLERANCE))
         return n if 0 < n < self.n and np.abs(self.t[:n] - t[-n:]).max() < TIME_TOLERANCE else 0
+
+
+def near_angle(angle: Array, step: Array) -> Array:
+    """Entry angles [rad] after a step of the linear model, which changes them by a factor within 0.6 and 1.6."""
+    return np.asarray(np.clip(angle + step, angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)))
 
 
 def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Array:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,6 +182,12 @@ class Coordinates:
     def _column(self) -> dict[int, int]:
         """Index among the coordinates of each free parameter."""
         return {parameter: i for i, parameter in enumerate(self.free.tolist())}
+
+
+@lru_cache(maxsize=16)
+def coordinates_of(prior: SoilPrior, width: float, options: SearchOptions) -> Coordinates:
+    """Return the coordinates, the same ones for the same prior."""
+    return Coordinates(prior, width, options)
 
 
 def at_bounds(value: Array, low: Array, high: Array) -> Array:

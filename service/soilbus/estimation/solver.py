@@ -33,7 +33,7 @@ from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic
 from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
-from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
+from soilbus.estimation.parametrization import at_bounds, coordinates_of, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
 
@@ -123,11 +123,6 @@ class WindowModel(QuadraticModel):
     linearisation: Linearisation
 
 
-def coordinates_of(problem: ObservationModel, prior: SoilPrior) -> Coordinates:
-    """Return the coordinates of a window's free parameters."""
-    return Coordinates(prior, float(problem.rig.width.mean()), problem.options.search)
-
-
 class Objective:
     """-2 log posterior of a window: its residuals and those of its prior, with derivatives.
 
@@ -158,7 +153,7 @@ class Objective:
         as_measured: bool = False,
     ) -> None:
         self.problem, self.joint_prior, self.options = problem, joint_prior, problem.options.search
-        self.coordinates = coordinates_of(problem, prior)
+        self.coordinates = coordinates_of(prior, problem.rig.mean_width, self.options)
         self.as_measured = as_measured
         is_active = np.diag(joint_prior.covariance)[_SOIL:] > 0.0
         is_active[: problem.n_sensors if as_measured else 0] = False

@@ -36,7 +36,7 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import ESTIMATOR
-from soilbus.estimation.parametrization import Coordinates
+from soilbus.estimation.parametrization import coordinates_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.prediction import Share, prediction_shares
 from soilbus.estimation.search_budget import SearchBudget
@@ -515,7 +515,8 @@ class Tracker:
 
     def _drift(self, gaussian: Gaussian, elapsed: float) -> Array:
         """Covariance (6, 6) of the drift of the soil's logarithms in `elapsed` windows."""
-        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(gaussian.soil)
+        coordinates = coordinates_of(self.soil_prior, self.rig.mean_width, self.rig.options.search)
+        directions = coordinates.log_directions(gaussian.soil)
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
     def _ended(self, t: float) -> list[int]:
@@ -531,9 +532,8 @@ class Tracker:
         if fit is None or not fit.converged:
             return fit
         form = self._form_posterior(objective, fit)
-        half = self.options.steady_drift * self.settings.drift / 2.0  # from a window's middle to its end
-        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(fit.mode.soil)
-        mode = fit.mode.drifted(half**2 * (directions @ directions.T), np.zeros(len(fit.gains)))
+        half = (self.options.steady_drift / 2.0) ** 2  # from a window's middle to its end
+        mode = fit.mode.drifted(self._drift(fit.mode, half), np.zeros(len(fit.gains)))
         return replace(fit, mode=mode, form=form)
 
     def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:

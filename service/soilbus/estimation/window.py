@@ -105,6 +105,11 @@ class Rig:
     """Tuning values of its estimator."""
 
     @property
+    def mean_width(self) -> float:
+        """Mean width [m] of the tyres."""
+        return float(self.width.mean())
+
+    @property
     def length(self) -> Array | float:
         """Contact lengths [m] (W,); the number 0 where all are wheels."""
         return 0.0 if self.lengths is None else self.lengths
