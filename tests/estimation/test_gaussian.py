@@ -80,7 +80,7 @@ def test_the_prior_factor_is_the_product_of_likelihood_and_prior(name, simulated
         of_data = (ratio + 1.0) ** 2 / variance[i, i] + of_k_phi**2 / variance[1, 1]
         expected.append(of_data + (np.log(soil[i] / prior.median[i]) / prior.log_std[i]) ** 2)
     assert np.array(values) - values[-1] == pytest.approx(np.array(expected) - expected[-1], rel=1e-6, abs=1e-6)
-    assert min(values) > -0.05  # -2 log prior is zero at its least value
+    assert objective.prior_at(Iterate(mode.soil, factor.gains, None)).neg2_log_prior == pytest.approx(0.0, abs=1e-9)
 
 
 def test_without_prior_variance_the_likelihood_factor_is_the_gaussian():

@@ -8,7 +8,7 @@ or, for a likelihood factor, which is Gaussian in y = k_c, n, tan phi and c them
 log k_phi (`deviations`), with offset e in units of their change with the logarithm at the soil y0,
 
     p_y = (y - y0) / (dy/dlog)_0 - e,    p_R = log parameter - log prior median
-    -2 log prior = p' diag(C^-1, prior sd^-2) p - least value
+    -2 log prior = p' diag(C^-1, prior sd^-2) p - value at y0
 
 A window determines combinations of soil and gains, so its posterior is kept jointly.  Gains do not change from
 window to window; without their covariance with the soil the same ignorance would count as new information each
@@ -199,8 +199,8 @@ class PriorFactor:
     precision : (R, R)
         Of the residuals.  R is F + A, and one more for each free parameter of LINEAR where the prior is a likelihood
         factor: besides the parameter's own residual there is one of its logarithm, by the configured prior.
-    least_value : float
-        Least -2 log of likelihood factor and these priors together, which is subtracted from every value.
+    value_at_mean : float
+        -2 log of likelihood factor and these priors together at the mean, which is subtracted from every value.
 
     Raises
     ------
@@ -217,7 +217,7 @@ class PriorFactor:
         self.precision = inverse[1]
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
         self._zero_gradient, self._width = np.zeros(len(unknowns)), width
-        self.least_value = 0.0
+        self.value_at_mean = 0.0
         self._offset = np.zeros(_SOIL) if gaussian_prior.offset is None else gaussian_prior.offset
         self._is_likelihood_factor = gaussian_prior.offset is not None
         self._last_deviations: tuple[Array, tuple[Array, Array]] | None = None
@@ -229,7 +229,11 @@ class PriorFactor:
             self.precision[range(n, len(self.precision)), range(n, len(self.precision))] = (
                 prior.log_std[self._linear] ** -2
             )
-            self.least_value = self._least()
+            of_linear = gaussian_prior.covariance[np.ix_(self._linear, self._linear)]
+            off = self._offset[self._linear]
+            logs = np.log(gaussian_prior.soil[self._linear] / prior.median[self._linear])
+            of_logs = logs / prior.log_std[self._linear]
+            self.value_at_mean = float(off @ np.linalg.solve(of_linear, off) + of_logs @ of_logs)
 
     def quadratic_at(self, soil: Array, gains: Array, by_logs: Array) -> PriorQuadratic:
         """Return -2 log prior about a soil (6,) with gains (G,).
@@ -247,7 +251,7 @@ class PriorFactor:
         if self._is_likelihood_factor:
             of_data = gradient.copy()
             of_data[self._place] -= weighted[len(by_logs) :]
-        value = float(off @ weighted) - self.least_value
+        value = float(off @ weighted) - self.value_at_mean
         return PriorQuadratic(slopes.T @ self.precision @ slopes, gradient, value, of_data)
 
     def residuals(self, soil: Array, gains: Array) -> Array:
@@ -288,25 +292,6 @@ class PriorFactor:
         if self._is_likelihood_factor:  # the priors of the logarithms do not shift
             by_mean = np.vstack([by_mean, np.zeros((len(self._linear), by_mean.shape[1]))])
         return by_mean, self.precision, self.residuals(soil, gains)
-
-    def _least(self) -> float:
-        """Least -2 log of the likelihood factor of LINEAR and the priors of their logarithms together."""
-        base, prior, linear = self._gaussian_prior.soil, self._prior, self._linear
-        precision = np.linalg.inv(self._gaussian_prior.covariance[np.ix_(linear, linear)])
-        of_prior, soil, least = prior.log_std[linear] ** -2, base.copy(), math.inf
-        for _ in range(20):  # two or three do
-            changes, by_logs = deviations(soil, base, self._width)
-            off, slopes = (changes - self._offset)[linear], by_logs[linear, linear]
-            log = np.log(soil[linear] / prior.median[linear])
-            weighted = precision @ off
-            least = min(least, float(off @ weighted + log @ (of_prior * log)))
-            curved = slopes[:, None] * precision * slopes + np.diag(of_prior + np.maximum(weighted * slopes, 0.0))
-            step = -np.linalg.solve(curved, slopes * weighted + of_prior * log)
-            step *= min(1.0, 1.0 / float(np.abs(step).max()))
-            soil[linear] *= np.exp(step)
-            if np.abs(step).max() < 1e-3:
-                break
-        return least
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:
