@@ -169,15 +169,11 @@ class PriorQuadratic(NamedTuple):
         Half the gradient.
     neg2_log_prior : float
         The value.
-    gradient_of_data : (F + A,)
-        The part of the gradient that is Gaussian in the LINEAR parameters: without the priors of their logarithms; 0
-        where all of it is log-normal.
     """
 
     information: Array
     gradient: Array
     neg2_log_prior: float
-    gradient_of_data: Array
 
 
 class PriorFactor:
@@ -216,7 +212,7 @@ class PriorFactor:
             raise ValueError("the prior has no proper covariance")
         self.precision = inverse[1]
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
-        self._zero_gradient, self._width = np.zeros(len(unknowns)), width
+        self._width = width
         self.value_at_mean = 0.0
         self._offset = np.zeros(_SOIL) if gaussian_prior.offset is None else gaussian_prior.offset
         self._is_likelihood_factor = gaussian_prior.offset is not None
@@ -247,12 +243,8 @@ class PriorFactor:
         """
         off, slopes = self.residuals(soil, gains), self.jacobian(soil, by_logs)
         weighted = self.precision @ off
-        gradient, of_data = slopes.T @ weighted, self._zero_gradient
-        if self._is_likelihood_factor:
-            of_data = gradient.copy()
-            of_data[self._place] -= weighted[len(by_logs) :]
         value = float(off @ weighted) - self.value_at_mean
-        return PriorQuadratic(slopes.T @ self.precision @ slopes, gradient, value, of_data)
+        return PriorQuadratic(slopes.T @ self.precision @ slopes, slopes.T @ weighted, value)
 
     def residuals(self, soil: Array, gains: Array) -> Array:
         """Return the residuals (R,) of a soil (6,) with gains (G,)."""

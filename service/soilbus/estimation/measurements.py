@@ -300,8 +300,8 @@ class Measurements:
         self.n = len(self.t)
         self._n_known = int(self._known.sum())
         self._missing = None if self._n_known == self._known.size else ~self._known
-        self._radius, self._width = np.tile(self.rig.radius, self.n), np.tile(self.rig.width, self.n)
-        self._length = 0.0 if self.rig.lengths is None else np.tile(self.rig.lengths, self.n)
+        length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
+        self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""

@@ -132,17 +132,15 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
         return prior
     by_form, weighed = problem.by_form(optimum)
     by_form, weighed = by_form[:, free], weighed[:, free]
-    prior_by_form, precision, off = objective.prior_factor.jacobian_by_mean(
+    prior_by_form, of_prior, off = objective.prior_factor.jacobian_by_mean(
         optimum.soil, optimum.gains, prior.by_form[:, free]
     )
     columns = weighed.T @ optimum.at.rows
     directions = objective.directions(Iterate.of(optimum))
-    cross = columns @ directions + prior_by_form.T @ precision @ objective.prior_jacobian(optimum)
-    gradient = columns[:, 0] + prior_by_form.T @ (precision @ off)
-    information = by_form.T @ weighed + prior_by_form.T @ precision @ prior_by_form
-    own = solve_with_inverse(prior.covariance[np.ix_(free, free)], prior.mean[free])
-    if own is None:
-        return prior
+    cross = columns @ directions + prior_by_form.T @ of_prior @ objective.prior_jacobian(optimum)
+    gradient = columns[:, 0] + prior_by_form.T @ (of_prior @ off)
+    information = by_form.T @ weighed + prior_by_form.T @ of_prior @ prior_by_form
+    precision = 1.0 / np.diag(prior.covariance)[free]  # of independent parameters
     following = fit.covariance @ cross.T  # minus the derivatives of coordinates and gains by the form
     information = information - cross @ following
     of_gradient = cross @ fit.last_step
@@ -150,7 +148,9 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
         problem.n, -1, len(free)
     )
     discount = _discount(scores.sum(axis=1), information, problem) * problem.options.posterior.form_discount
-    found = solve_with_inverse(information / discount + own[1], own[0] + (of_gradient - gradient) / discount)
+    found = solve_with_inverse(
+        information / discount + np.diag(precision), precision * prior.mean[free] + (of_gradient - gradient) / discount
+    )
     if found is None:
         return prior
     sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)

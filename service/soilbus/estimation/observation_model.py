@@ -51,7 +51,6 @@ from soilbus.estimation.linearisation import (
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import (
     INPUTS,
     MAX_ENTRY_ANGLE,
@@ -59,6 +58,7 @@ from soilbus.terra.wheel import (
     WheelModel,
     WheelState,
     sinkage,
+    state_on,
     wheel_forces_and_derivatives,
 )
 
@@ -503,7 +503,7 @@ class ObservationModel(Measurements):
         layout, (n, m) = self.layout, at.by_latents.shape[:2]
         some = max(math.ceil(n / self.options.posterior.form_stride), 2)
         instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
-        sparse = self.part(instants)._contact_by_form(soil, gains, latents.part(instants))
+        sparse = self._contact_by_form(soil, gains, latents, instants)
         by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
@@ -517,14 +517,14 @@ class ObservationModel(Measurements):
         weighed = at.inverse @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
-    def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:
-        """Derivatives (3, 3, N, W) of drawbar pull, torque and sinkage by three form parameters, at the latent loads.
+    def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]) -> Array:
+        """Derivatives (3, 3, S, W) of drawbar pull, torque and sinkage by three form parameters, at some instants.
 
         The form parameters are the ratio of the angle of greatest stress to the entry angle, the
         ratio of the exit angle (positive behind the axle) to it, and the share of the other shear law.
         """
-        shape, other = (self.n, self.n_wheels), 1.0
-        state, model = self._wheels_in_contact(soil, gains, latents)
+        shape, other = (len(instants), self.n_wheels), 1.0
+        state, model = self._wheels_in_contact(soil, gains, latents, instants)
         if model.shear_law == "exponential":  # the same law as a share of 1, which can be reduced
             model, other = replace(model, shear_law="rational", exponential_share=1.0), -1.0
         _, d = wheel_forces_and_derivatives(state, model, ("peak", "leave", "exponential_share"))
@@ -534,20 +534,19 @@ class ObservationModel(Measurements):
         angle_by_form = -by_form[0] / by_angle[0]
         out = np.empty((3, 3, *shape))
         out[:2] = by_form[1:] + by_angle[1:, None] * angle_by_form
-        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle) * angle_by_form
+        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle[instants]) * angle_by_form
         return out
 
-    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
-        """States and model of the wheels at the latents."""
+    def _wheels_in_contact(
+        self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]
+    ) -> tuple[WheelState, WheelModel]:
+        """States and model of the wheels at some instants."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        return self._state(soil, latents.entry_angle, slip), self.model
+        return self._state(soil, latents.entry_angle[instants], slip[instants]), self.model
 
     def _state(self, soil: Soil, angle: Array, slip: Array) -> WheelState:
-        K_L = lumped_modulus(soil.k_c, soil.k_phi, self._width)
-        return WheelState(
-            angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K,
-            self._length,
-        )  # fmt: skip
+        radius, width, length = self._geometry[:, : angle.size]
+        return state_on(soil, angle.ravel(), slip.ravel(), radius, width, length)
 
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
         """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).

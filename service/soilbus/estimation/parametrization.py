@@ -94,25 +94,6 @@ class Coordinates:
         self._last_directions[:] = soil, directions
         return directions
 
-    def curvature(self, gradient: Array) -> Array:
-        """Return the curvature (F, F) that the coordinates themselves add to the objective.
-
-        Parameters
-        ----------
-        gradient : (F,)
-            Half the gradient of what is linear in k_c.
-
-        Notes
-        -----
-        The model is nearly linear in k_c, and so curved in log k_c.  Only the positive part counts, which
-        shortens steps.
-        """
-        curvature = np.zeros((len(gradient), len(gradient)))
-        if _K_C in self._column:
-            i = self._column[_K_C]
-            curvature[i, i] = max(gradient[i], 0.0)
-        return curvature
-
     def stepped(self, soil: Array, step: Array) -> Array:
         """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`.
 

@@ -6,10 +6,8 @@ covariance, p the residuals of the prior and P its precision,
     objective     F(theta) = -2 log posterior = r' W r + p' P p + constant
     Jacobian      J = dr/dtheta,   J_p = dp/dtheta
     model         gradient g = J' W r + J_p' P p,   information H = J' W J + J_p' P J_p
-    step          (H + C) d = -g,   subject to the active bounds
+    step          H d = -g,   subject to the active bounds
     decrease      of F, predicted for a full step: D = d' H d, its squared length in posterior sd
-
-C is the positive part of the curvature that the coordinates add (parametrization.Coordinates.curvature).
 
 `Objective` evaluates residuals, Jacobian and prior at an `Iterate` and returns the `QuadraticModel` there.  `minimise`
 is the loop: step, evaluate, accept or reject.  `SolverOptions` holds its numbers, `Termination` says why it ended.
@@ -68,8 +66,6 @@ class QuadraticModel:
         Gauss-Newton Hessian, half that of -2 log posterior: data and prior.
     prior_information : (F + A, F + A)
         The prior's part of it.
-    curvature : (F + A, F + A)
-        What the coordinates' own curvature adds for a step.
     gradient : (F + A,)
         Half the gradient of -2 log posterior.
     neg2_log_posterior : float
@@ -80,7 +76,6 @@ class QuadraticModel:
 
     information: Array
     prior_information: Array
-    curvature: Array
     gradient: Array
     neg2_log_posterior: float
     active_bounds: Array
@@ -91,7 +86,7 @@ class QuadraticModel:
         A step that would cross an active bound goes along it, to the least value there.
         """
         right = np.concatenate([self.gradient[None], self.active_bounds]).T
-        solution = _solution(self.information + self.curvature, right)
+        solution = _solution(self.information, right)
         if solution is None:
             return None
         step = -solution[:, 0]
@@ -256,7 +251,6 @@ class Objective:
 
     def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> WindowModel | None:
         """Return the quadratic model from the data's linearisation at an iterate; None where it is not finite."""
-        free = len(self.free)
         directions = self.directions(iterate)
         if self.as_measured:
             directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
@@ -265,12 +259,9 @@ class Objective:
         neg2_log_posterior = linearisation.chi2 + prior.neg2_log_prior
         if not math.isfinite(neg2_log_posterior):
             return None
-        curvature = np.zeros_like(self._identity)
-        curvature[:free, :free] = self.coordinates.curvature((gradient + prior.gradient_of_data)[:free])
         return WindowModel(
             information=directions.T @ linearisation.normal @ directions + prior.information,
             prior_information=prior.information,
-            curvature=curvature,
             gradient=gradient + prior.gradient,
             neg2_log_posterior=neg2_log_posterior,
             active_bounds=self._active_bounds(iterate),
