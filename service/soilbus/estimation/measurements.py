@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
-from soilbus.estimation.local_cubics import Curve, Instants, Series, curve_of, kept_noise
+from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
 from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -106,7 +106,7 @@ class Measurements:
         window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
-        yaw_rate = self._curves.of("yaw_rate")[0].smooth.at(window.t)[0]
+        yaw_rate = self._curves.of("yaw_rate")[0].at(window.t)[0]
         straight, window = moving & ~in_turn, straightened(window, rig, yaw_rate)
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -206,7 +206,7 @@ class Measurements:
             return self
         window = self._curves.window
         smooth = {
-            quantity: np.stack([curve.smooth.at(window.t)[0] for curve in self._curves.of(quantity)], axis=1)
+            quantity: np.stack([curve.at(window.t)[0] for curve in self._curves.of(quantity)], axis=1)
             for quantity in ("torque", "load", "speed", "ground_speed", "draft", "acceleration")
         }
         shaped: dict[str, Any] = {
@@ -410,7 +410,7 @@ class Measurements:
         """Time [s] between samples of a quantity, the longest of its channels; 0 where only bins are known."""
         names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
         curves = self._curves.window.curves
-        return max((curves[name].smooth.step for name in names if name in curves), default=0.0)
+        return max((curves[name].step for name in names if name in curves), default=0.0)
 
     def shifted(self, quantity: str, column: int, curve: Curve, delay: float, tau: float) -> Array:
         """Return by how much a column of a quantity (N,) changes where a delay and a low pass [s] are taken out."""
@@ -428,7 +428,7 @@ class Measurements:
         self, quantity: str, column: int, curve: Curve, delay: float, tau: float, low_pass: float = 0.0
     ) -> float:
         """Return the factor on what is beside a curve, with which a shift [s] keeps the noise of instants."""
-        of_value = self._curves.of(quantity)[column].smooth.half_width
+        of_value = self._curves.of(quantity)[column].half_width
         if not (curve.half_width and of_value and self.n > 1):
             return 1.0
         length = float(np.median(np.diff(self._curves.window.t)))
@@ -464,9 +464,9 @@ class Curves:
     def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
         self.window = window
         self._wheels = wheels
-        self._cache: dict[str, list[Series]] = {}
+        self._cache: dict[str, list[Curve]] = {}
 
-    def of(self, quantity: str) -> list[Series]:
+    def of(self, quantity: str) -> list[Curve]:
         """The curves of a quantity: one for each wheel, or one for the vehicle."""
         if quantity not in self._cache:
             values, variances = getattr(self.window, quantity), self.window.variance[quantity]
@@ -483,9 +483,9 @@ class Curves:
         values = getattr(self.window, quantity)
         return 1 if values.ndim == 1 else int(values.shape[1])
 
-    def _curve(self, values: Array, variance: Array) -> Series:
+    def _curve(self, values: Array, variance: Array) -> Curve:
         known = np.isfinite(values) & np.isfinite(variance)
-        return Series.of(self.window.t[known], values[known], variance[known])
+        return curve_of(self.window.t[known], values[known], variance[known])
 
 
 def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -547,7 +547,7 @@ def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array
     """
     if len(t) < 3:
         return np.zeros(len(t)), np.full(len(t), 1.0)
-    curve = Series.of(t, speed, variance).faithful
+    curve = faithful(curve_of(t, speed, variance), speed)
     near = np.ones(2 * max(curve.half_width, 1) + 1)
     spread, noise = (np.convolve(a, near, "same") for a in ((speed - curve.value) ** 2, variance))
     count = np.convolve(np.ones(len(t)), near, "same")

@@ -261,8 +261,7 @@ class ObservationModelWithEffects(ObservationModel):
                     predicted, rate, by_tau = self._low_pass_terms(tau, latents, torque)
                     by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
                     tau, std, of_tau = 0.0, 0.0, 0.0
-                for column, series in enumerate(self._curves.of(quantity)):
-                    curve = series.smooth
+                for column, curve in enumerate(self._curves.of(quantity)):
                     _, slope, second = curve.at(self.t + d)
                     added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d, tau))
                     by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
@@ -298,9 +297,7 @@ class ObservationModelWithEffects(ObservationModel):
         and speeds by a polynomial in load and slip through the model's own torques.
         """
         off, slope, by_tau = (np.zeros(torque.shape) for _ in range(3))
-        loads, speeds, (ground,) = (
-            [series.smooth for series in self._curves.of(q)] for q in ("load", "speed", "ground_speed")
-        )
+        loads, speeds, (ground,) = (self._curves.of(q) for q in ("load", "speed", "ground_speed"))
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         for w, (load, speed) in enumerate(zip(loads, speeds, strict=True)):
             used = self.usable[:, w]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.local_cubics import Series
+from soilbus.estimation.local_cubics import Curve
 from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.terra.vehicle import Chassis, pull_required
 
@@ -161,7 +161,7 @@ class Window:
     variance: Mapping[str, Array]
     samples: int
     yaw_rate: Array = field(default_factory=lambda: np.empty(0))
-    curves: Mapping[str, Series] = field(default_factory=dict)
+    curves: Mapping[str, Curve] = field(default_factory=dict)
     roll: Array = field(default_factory=lambda: np.empty(0))
     steering_angle: Array = field(default_factory=lambda: np.empty(0))
     differential_lock: Array = field(default_factory=lambda: np.empty(0))
