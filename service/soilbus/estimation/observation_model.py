@@ -480,7 +480,7 @@ class ObservationModel(Measurements):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(self.usable, depth, 0.0).sum(0) / known)
 
-    def standardised(self, at: Linearisation, gains: Array) -> tuple[Array, Array]:
+    def standardised(self, at: Linearisation) -> tuple[Array, Array]:
         """Each residual given the others of its instant, over its sd, and its derivatives in the same units.
 
         Returns
@@ -490,9 +490,7 @@ class ObservationModel(Measurements):
         derivatives : Array
             (N, m, 6 + G).
         """
-        variance, row_var = self.variances(gains)
-        inverse = self.inverse_covariance(at.by_latents, variance, row_var)
-        root = np.sqrt(np.einsum("nmm->nm", inverse))
+        root = np.sqrt(np.einsum("nmm->nm", at.inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
         weighed[~self._known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
