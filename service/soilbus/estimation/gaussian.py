@@ -234,12 +234,7 @@ class PriorFactor:
     def quadratic_at(self, soil: Array, gains: Array, by_logs: Array) -> PriorQuadratic:
         """Return -2 log prior about a soil (6,) with gains (G,).
 
-        Parameters
-        ----------
-        soil, gains
-            In SI, and (G,).
-        by_logs : (F + A, F + A)
-            Derivatives of logarithms and gains by coordinates and gains.
+        by_logs (F + A, F + A): derivatives of logarithms and gains by coordinates and gains.
         """
         off, slopes = self.residuals(soil, gains), self.jacobian(soil, by_logs)
         weighted = self.precision @ off
@@ -256,14 +251,9 @@ class PriorFactor:
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
     def jacobian(self, soil: Array, by_logs: Array) -> Array:
-        """Return the derivatives (R, M) of the residuals by M unknowns.
+        """Return the derivatives (R, M) of the residuals at a soil (6,) by M unknowns.
 
-        Parameters
-        ----------
-        soil : (6,)
-            In SI.
-        by_logs : (F + A, M)
-            Derivatives of logarithms and gains by the unknowns.
+        by_logs (F + A, M): derivatives of logarithms and gains by the unknowns.
         """
         if not self._is_likelihood_factor:
             return by_logs

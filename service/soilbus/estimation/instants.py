@@ -23,21 +23,9 @@ _QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
 
 
 def averaged(window: Window, end: float, length: float) -> Window:
-    """Return the window with the means of its bins over instants of this length [s], counted back from `end` [s].
+    """Return the window with means of its bins over instants of this length [s], counted back from `end` [s].
 
-    Parameters
-    ----------
-    window : Window
-        Bin means and variances; nan where unknown.
-    end : float
-        Time [s] at which the last instant ends.
-    length : float
-        Of an instant; 0 returns the window itself.
-
-    Returns
-    -------
-    Window
-        A value is known where one of its bins is.
+    A value is known where one of its bins is; length 0 returns the window itself.
     """
     if not length or not len(window.t):
         return window

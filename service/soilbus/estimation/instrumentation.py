@@ -223,20 +223,10 @@ def unit(n_wheels: int, wheel: int) -> tuple[float, ...]:
 
 
 def completed(window: Window, rig: Rig) -> Window:
-    """Return a forward window with a torque, speed and load of every wheel.
+    """Return a forward window (`forward`) with a torque, speed and load of every wheel.
 
-    Parameters
-    ----------
-    window : Window
-        From `forward`: channels as measured, each in its own column (`rows_of`).
-    rig : Rig
-        With its instrumentation.
-
-    Returns
-    -------
-    Window
-        Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
-        rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
+    Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
+    rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
     """
     window = _of_vehicle(window, rig)
     given = rig.instrumentation

@@ -70,13 +70,7 @@ class Curve(NamedTuple):
 
 
 def curve_of(t: Array, value: Array, variance: Array) -> Curve:
-    """The curve of least estimated risk.
-
-    Parameters
-    ----------
-    t, value, variance : Array
-        Ascending times [s], samples and their noise variances, (K,).
-    """
+    """The curve of least estimated risk through samples (K,) at ascending times [s] with these noise variances."""
     best, least = 0, 2.0  # of no smoothing w0 = 1
     _, runs = _runs(t)
     weight = 1.0 / np.where(variance > 0.0, variance, np.inf)

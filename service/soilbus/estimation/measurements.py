@@ -488,21 +488,10 @@ def wheel_rotation(t: Array, speed: Array) -> Array:
 def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:
     """Acceleration as the slope of the ground speed's smooth curve (`local_cubics`), and its variance.
 
-    var a = max(mean var V, mean (V - curve)^2) * sum of squared weights of the slope,  means over the cubic's samples
+        var a = max(mean var V, mean (V - curve)^2) * sum of squared weights of the slope,  over a cubic's samples
 
-    Parameters
-    ----------
-    t, speed, variance : Array
-        Times [s], ground speeds [m/s] and variances of these, (N,).
-
-    Returns
-    -------
-    acceleration, variance : Array
-        [m/s^2] and its square, (N,); 0 and 1 of fewer than three speeds.
-
-    Notes
-    -----
-    The misfit counts as noise where it is more, so that harsh driving does not pass for precise data.
+    Both (N,); 0 and 1 of fewer than three speeds.  The misfit counts as noise where it is more, so that harsh driving
+    does not pass for precise data.
     """
     if len(t) < 3:
         return np.zeros(len(t)), np.full(len(t), 1.0)

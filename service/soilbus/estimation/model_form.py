@@ -112,19 +112,9 @@ def with_form_step(model: WheelModel, step: Array) -> WheelModel:
 
 
 def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> FormPosterior:
-    """Return the posterior of the form parameters after a window's fit.
+    """Return the posterior of the form parameters after a window's fit on the configured form.
 
-    Parameters
-    ----------
-    objective, fit
-        Of the window, on the configured form; converged.
-    prior
-        Of the form, with how the prior of soil and gains depends on it.
-
-    Returns
-    -------
-    FormPosterior
-        The prior itself where every form parameter is held or the normal equations are singular.
+    The prior itself where every form parameter is held or the normal equations are singular.
     """
     problem, optimum = objective.problem, fit.optimum
     free = np.flatnonzero(np.diag(prior.covariance) > 0.0)

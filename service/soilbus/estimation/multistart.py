@@ -102,19 +102,8 @@ class Fit:
 def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Fit | None:
     """Return the posterior of a window of which only the prior is known, from several starts.
 
-    Parameters
-    ----------
-    problem
-        The window.
-    prior
-        Of the soil.
-    joint_prior
-        Posterior of earlier windows, in place of the prior.
-
-    Returns
-    -------
-    Fit or None
-        None if no descent ends at a finite optimum.
+    joint_prior: posterior of earlier windows, in place of the soil's prior.  None where no descent ends at a finite
+    optimum.
     """
     joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
     options, objective = problem.options.search, Objective(problem, prior, joint_prior)

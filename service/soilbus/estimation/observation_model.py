@@ -203,15 +203,7 @@ class ObservationModel(Measurements):
         )
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
-        """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring.
-
-        Parameters
-        ----------
-        A : Array
-            Derivatives of the residuals by the observations (N, m, 2 W + 1).
-        variance, row_var : Array
-            From `variances`.
-        """
+        """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring; arguments as there."""
         if not self.computes_loads:
             return inverse_covariance(A, variance, row_var)
         balance, of_loads = self.layout.balance, A[:, :, self._prior_only]
@@ -364,17 +356,7 @@ class ObservationModel(Measurements):
         return None
 
     def delay_residuals(self, delay: DelayTerms | None, A: Array, gains: Array) -> Array:
-        """Part (N, m) of the residuals due to delays.
-
-        Parameters
-        ----------
-        delay : DelayTerms or None
-            From `delay_terms`.
-        A : Array
-            Derivatives of the residuals by the latents (N, m, 2 W + 1).
-        gains : Array
-            Sensor gains, then effect parameters (G,).
-        """
+        """Part (N, m) of the residuals due to delays; A (N, m, 2 W + 1): their derivatives by the latents."""
         residual, layout = np.zeros(A.shape[:2]), self.layout
         if delay is not None:
             gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
@@ -385,16 +367,9 @@ class ObservationModel(Measurements):
         return residual
 
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
-        """Latents at their conditional optimum after a step of soil and gains: the linear model.
+        """Latents at their conditional optimum after a step of the soil (6,) in SI and of gains (G,): the linear model.
 
-        Parameters
-        ----------
-        at : Linearisation
-            With derivatives by the sensor gains, at `latents`.
-        latents : Latents
-            Where `at` was linearised.
-        soil_step, gain_step : Array
-            (6,) in SI and (G,).
+        `at` is the linearisation at `latents`, with derivatives by the sensor gains.
         """
         layout = self.layout
         weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
@@ -460,14 +435,9 @@ class ObservationModel(Measurements):
             return np.asarray(np.where(self.usable, depth, 0.0).sum(0) / known)
 
     def standardised(self, at: Linearisation) -> tuple[Array, Array]:
-        """Each residual given the others of its instant, over its sd, and its derivatives in the same units.
+        """Each residual given the others of its instant, over its sd (N, m), and derivatives (N, m, 6 + G) of these.
 
-        Returns
-        -------
-        residual : Array
-            (N, m), standard normal where model and noise are right; nan without a measurement.
-        derivatives : Array
-            (N, m, 6 + G).
+        Standard normal where model and noise are right; nan without a measurement.
         """
         root = np.sqrt(np.einsum("nmm->nm", at.inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
@@ -589,21 +559,12 @@ SINGULAR_RIDGE = 1e-10
 
 
 def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array | None = None) -> Array:
-    """Inverse covariance (A V A' + R)^-1 (N, m, m) of the residuals of every instant.
+    """Inverse covariance (A V A' + R + further)^-1 (N, m, m) of the residuals of every instant.
 
-    Parameters
-    ----------
-    A : Array
-        Derivatives of the residuals by the observations (N, m, 2 W + 1).
-    variance, row_var : Array
-        Diagonals of V (N, 2 W + 1) and R (N, m): variances of observations and rows.
-    further : Array, optional
-        Covariance (N, m, m) besides.
-
-    Notes
-    -----
-    Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point far from any soil one
-    latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a point of finite cost.
+    A: derivatives of the residuals by the observations (N, m, 2 W + 1); variance (N, 2 W + 1) and row_var (N, m):
+    diagonals of V and R.  Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point
+    far from any soil one latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a
+    point of finite cost.
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
     diagonal = np.einsum("nmm->nm", S)  # a view

@@ -228,17 +228,6 @@ class ObservationModelWithEffects(ObservationModel):
     def delay_terms(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
         """Corrections for measurements y late by d and by a low pass of tau: x(t) = (1 + tau d/dt) y(t + d).
 
-        Parameters
-        ----------
-        gains : Array
-            Sensor gains, then effect parameters (G,).
-        latents : Latents
-            Of all N instants.
-        torque : Array
-            Torques of the model (N, W) [N m].
-
-        Notes
-        -----
         y(t + d) = s(t + d) + c (y(t) - s(t)) with the smooth curve s of the measurements (see
         local_cubics): the noise of an instant stays with it, and c keeps its variance.  Else every
         delay would pair other noises or cancel a part, and some would seem to fit better.

@@ -114,21 +114,7 @@ class Shown(NamedTuple):
 
 
 def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
-    """Return the state after a window that ended at `end` [s], of length `window` [s].
-
-    Parameters
-    ----------
-    state : SoilState
-        After the window before.
-    shown : Shown
-        What the window shows.
-    end, window : float
-        [s].
-
-    Returns
-    -------
-    SoilState
-    """
+    """Return the state after a window of length `window` that ended at `end` [s]."""
     S, transition, now = TrackerState, shown.transition, replace(state, change=shown.change, mismatch=shown.mismatch)
     if shown.found in (Reason.CHANGE_STATISTIC, Reason.MISMATCH):
         return replace(now, name=S.SUSPECT, reason=shown.found)

@@ -380,21 +380,8 @@ def minimise(
 ) -> Solution[PointT, ModelT]:
     """Descend from a start.
 
-    Parameters
-    ----------
-    objective
-        Of a window, or of recordings.
-    start
-        Where to begin.
-    options
-        Numbers of the descent.
-    last_decrease
-        Predicted decrease of the full step that led to the start; 0 where it is unknown.  None: the descent does not
-        end at the start, where the latents are as measured and the objective is underestimated.
-
-    Returns
-    -------
-    Solution
+    last_decrease is the predicted decrease of the full step that led to the start, 0 where it is unknown.  None: the
+    descent does not end at the start, where the latents are as measured and the objective is underestimated.
     """
     here = lowest = _expanded(objective, start)
     if here is None or lowest is None:

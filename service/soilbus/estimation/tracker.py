@@ -250,19 +250,7 @@ class Tracker:
         return self._components
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
-        """Estimate one window; windows come in their order.
-
-        Parameters
-        ----------
-        window : Window
-            Bin means and variances.
-        end : float
-            Time [s] of the window's end.
-
-        Returns
-        -------
-        TrackerOutput
-        """
+        """Estimate one window of bin means that ends at `end` [s]; windows come in their order."""
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
         if not recent:  # what windows before left is no measure of ground that none of them was on

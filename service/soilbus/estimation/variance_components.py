@@ -81,17 +81,7 @@ class VarianceComponents:
 
 
 def correction_ratios(problem: ObservationModel, optimum: Optimum, options: VarianceOptions) -> dict[str, float]:
-    """Return the factor of each kind of sensor by which its corrections exceed what its variance says.
-
-    Parameters
-    ----------
-    problem : ObservationModel
-        The fitted window.
-    optimum : Optimum
-        Its fit.
-    options : VarianceOptions
-        Length of a block.
-    """
+    """Return the factor of each kind of sensor by which its corrections exceed what its variance says."""
     values, expected, of_kind = corrections(problem, optimum.at, optimum.gains)
     squares = np.stack([(v**2).sum(axis=0) for v in (values, block_sums(values, problem.t, options.block))])
     shown = expected.sum(axis=0)
