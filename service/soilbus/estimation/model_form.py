@@ -122,12 +122,11 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
         return prior
     by_form, weighed = problem.by_form(optimum)
     by_form, weighed = by_form[:, free], weighed[:, free]
-    prior_by_form, of_prior, off = objective.prior_factor.jacobian_by_mean(
-        optimum.soil, optimum.gains, prior.by_form[:, free]
-    )
+    prior_by_form, of_prior = -prior.by_form[np.ix_(objective.unknowns, free)], objective.prior_precision
+    off = objective.prior_residuals(optimum.soil, optimum.gains)
     columns = weighed.T @ optimum.at.rows
     directions = objective.directions(Iterate.of(optimum))
-    cross = columns @ directions + prior_by_form.T @ of_prior @ objective.prior_jacobian(optimum)
+    cross = columns @ directions + prior_by_form.T @ of_prior @ objective.prior_jacobian(optimum.soil)
     gradient = columns[:, 0] + prior_by_form.T @ (of_prior @ off)
     information = by_form.T @ weighed + prior_by_form.T @ of_prior @ prior_by_form
     precision = 1.0 / np.diag(prior.covariance)[free]  # of independent parameters

@@ -27,7 +27,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic
+from soilbus.estimation.gaussian import Gaussian, PriorQuadratic, solve_with_inverse
 from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
@@ -159,8 +159,12 @@ class Objective:
         self._identity = np.eye(len(self.free) + len(self.active))
         self._gain_directions = np.zeros((FIRST_GAIN + len(joint_prior.gains), len(self._identity)))
         self._gain_directions[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
-        self.prior_factor = PriorFactor(joint_prior, prior, self.active, self.coordinates.width)
-        self._prior_cache: tuple[Array, Array, PriorQuadratic] | None = None
+        self.unknowns = np.concatenate([self.free, _SOIL + self.active])
+        of_unknowns = joint_prior.covariance[self.unknowns[:, None], self.unknowns]
+        solution = solve_with_inverse(of_unknowns, np.zeros(len(of_unknowns)))
+        if solution is None:
+            raise ValueError("the prior has no proper covariance")
+        self.prior_precision = solution[1]
 
     def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
         """Return the same window under another joint prior."""
@@ -269,14 +273,15 @@ class Objective:
         )
 
     def prior_at(self, iterate: Iterate) -> PriorQuadratic:
-        """Return the prior's quadratic at an iterate, and keep it for the next call with the same one."""
-        last = self._prior_cache
-        if last is None or last[0] is not iterate.soil or last[1] is not iterate.gains:
-            by_logs = self._identity.copy()
-            by_logs[: len(self.free), : len(self.free)] = self.coordinates.log_directions(iterate.soil)[self.free]
-            prior = self.prior_factor.quadratic_at(iterate.soil, iterate.gains, by_logs)
-            last = self._prior_cache = iterate.soil, iterate.gains, prior
-        return last[2]
+        """Return the prior's quadratic at an iterate."""
+        by_unknowns, off = self.prior_jacobian(iterate.soil), self.prior_residuals(iterate.soil, iterate.gains)
+        weighted = by_unknowns.T @ self.prior_precision
+        return PriorQuadratic(weighted @ by_unknowns, weighted @ off, float(off @ self.prior_precision @ off))
+
+    def prior_residuals(self, soil: Array, gains: Array) -> Array:
+        """Return log soil and gains less the prior's mean (F + A,), of what is free and active."""
+        logs = np.log(soil[self.free] / self.joint_prior.soil[self.free])
+        return np.concatenate([logs, (gains - self.joint_prior.gains)[self.active]])
 
     def directions(self, iterate: Iterate) -> Array:
         """Return the derivatives (1 + 6 + G, F + A) of (1, soil, gains) by free coordinates and active gains.
@@ -293,10 +298,9 @@ class Objective:
         jacobian[:_SOIL, : len(self.free)] = self.coordinates.log_directions(soil)
         return jacobian
 
-    def prior_jacobian(self, optimum: Optimum) -> Array:
-        """Return the derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
-        unknowns = np.concatenate([self.free, _SOIL + self.active])
-        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum.soil)[unknowns])
+    def prior_jacobian(self, soil: Array) -> Array:
+        """Return the derivatives (F + A, F + A) of the prior's residuals by coordinates and active gains."""
+        return self.parameter_jacobian(soil)[self.unknowns]
 
     def gaussian(self, soil: Array, gains: Array, covariance: Array) -> Gaussian:
         """Return the Gaussian with this covariance of coordinates and active gains."""

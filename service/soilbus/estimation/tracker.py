@@ -5,8 +5,7 @@
         soil   covariance += drift^2 elapsed D D'     (random walk of the coordinates, D their log directions)
         gains  variance   += gain_std^2 min((elapsed + 1) / 60, 1)
 
-    so that no sample counts twice.  Of k_c, n, phi and c the likelihood factor is carried, apart from their priors,
-    since likelihoods add up in k_c, n, tan phi and c and not in their logarithms (`Gaussian.likelihood_factor`).
+    so that no sample counts twice.
 
 A window is fitted as one soil, from the optimum of the last one (warm start).  Where the newest data disagree with
 that soil (change_detection) or it does not describe the window, another soil is searched for (`Tracker._explained`),
@@ -546,7 +545,7 @@ class Tracker:
         self._components = self._components.after(ratios)
         learned = end - tracked.since >= self.options.min_to_learn * self.settings.window
         if learned and state.name in (TrackerState.STEADY, TrackerState.NEW_SOIL):
-            self._posteriors.append((end, replace(fit.mode.likelihood_factor(self.soil_prior), form=fit.form)))
+            self._posteriors.append((end, replace(fit.mode, form=fit.form)))
             self._newest_posterior = fit.mode
 
 
