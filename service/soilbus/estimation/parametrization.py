@@ -95,32 +95,15 @@ class Coordinates:
         return directions
 
     def stepped(self, soil: Array, step: Array) -> Array:
-        """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`.
-
-        c and tan phi change linearly: along c + p tan phi, which a window at one pressure p measures alone, a step in
-        logarithms would leave the valley.
-        """
+        """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`."""
         step = step * min(1.0, self.options.max_log_step / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
-        new = self.soil_at(self.position(soil) + step)
-        if _C in self._column:
-            new[_C] = soil[_C] * (1.0 + step[self._column[_C]])
-        if _PHI in self._column:
-            phi, tan = float(soil[_PHI]), math.tan(soil[_PHI])
-            change = phi * (1.0 + tan**2) * float(step[self._column[_PHI]])
-            new[_PHI] = math.atan(tan + change)
-        return self.within(new)
+        return self.soil_at(self.position(soil) + step)
 
     def step_fraction(self, soil: Array, step: Array) -> float:
         """Return the fraction of a step (F,) from a soil (6,) within the bounds and `max_log_step`, 1 at most."""
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
-        if _C in self._column:  # changes linearly, see `stepped`
-            room[self._column[_C]] = np.expm1(room[self._column[_C]])
-        if _PHI in self._column:
-            column, tan = self._column[_PHI], math.tan(soil[_PHI])
-            bound = math.tan(soil[_PHI] * math.exp(room[column]))
-            room[column] = (bound - tan) / (soil[_PHI] * (1.0 + tan**2))
         longest = self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
 
