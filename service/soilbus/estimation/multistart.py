@@ -165,15 +165,15 @@ def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
 
-def _search(thin: Objective) -> list[_End]:
+def _search(thin: Objective) -> list[Solution[Iterate, WindowModel]]:
     """Ends of descents of the soil alone on a few instants, the best first.
 
     Descents from the starts in turn; two that meet at a plausible objective end the search.
     """
-    options, ends = thin.options, list[_End]()
+    options, ends = thin.options, list[Solution[Iterate, WindowModel]]()
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
-        end = _end_from(thin, np.asarray(start))
-        if end is None:
+        end = minimise(thin, thin.start(np.asarray(start)), options.soil_alone)
+        if end.model is None:
             continue
         met = any(abs(end.value - other.value) < options.same_end * other.value for other in ends)
         ends.append(end)
@@ -182,26 +182,9 @@ def _search(thin: Objective) -> list[_End]:
     return sorted(ends, key=lambda end: end.value)
 
 
-class _End(NamedTuple):
-    """Where a descent on a few instants ended: soil (6,), gains (G,), objective there, and evaluations of the model."""
-
-    soil: Array
-    gains: Array
-    value: float
-    evaluations: int
-
-
-def _end_from(thin: Objective, soil: Array) -> _End | None:
-    """The end of a descent on a few instants from a soil (6,); None where the numbers are not finite."""
-    end = minimise(thin, thin.start(soil), thin.options.soil_alone)
-    if end.model is None:
-        return None
-    return _End(end.previous.soil, end.previous.gains, end.model.neg2_log_posterior, end.evaluations)
-
-
-def _joint_fit(objective: Objective, end: _End) -> Fit | None:
+def _joint_fit(objective: Objective, end: Solution[Iterate, WindowModel]) -> Fit | None:
     """The fit to all instants from an end of the search; None where the numbers are not finite."""
-    options, start = objective.options, objective.start(end.soil, gains=end.gains)
+    options, start = objective.options, objective.start(end.previous.soil, gains=end.previous.gains)
     descent = options.cold
     if not end.value < options.implausible * options.thinned:
         descent = replace(descent, max_evaluations=options.max_implausible_evaluations)

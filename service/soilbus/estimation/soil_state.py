@@ -102,15 +102,14 @@ class Shown(NamedTuple):
         The last transition, found now or before.
     change
         The change point, where there is one.
-    mismatch, settled
-        Whether the fit exceeds its limit of chi-square; whether it keeps that just after a border.
+    mismatch
+        Whether the fit exceeds its limit of chi-square.
     """
 
     found: Reason | None
     transition: Transition | None
     change: ChangePoint | None
     mismatch: bool
-    settled: bool
 
 
 def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
@@ -122,6 +121,6 @@ def next_state(state: SoilState, shown: Shown, end: float, window: float) -> Soi
         one = Reason.ONE_SOIL if shown.change is None else Reason.UNCONFIRMED
         return replace(now, name=S.STEADY, reason=Reason.MISMATCH if shown.mismatch else one)
     now = replace(now, transition=transition)
-    if not shown.settled:
+    if shown.mismatch:
         return replace(now, name=S.TRANSITION, reason=Reason.UNSETTLED)
     return replace(now, name=S.NEW_SOIL, reason=shown.found or Reason.SPANS_BORDER)

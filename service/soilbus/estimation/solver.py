@@ -300,7 +300,7 @@ class Objective:
 
     def prior_jacobian(self, soil: Array) -> Array:
         """Return the derivatives (F + A, F + A) of the prior's residuals by coordinates and active gains."""
-        return self.parameter_jacobian(soil)[self.unknowns]
+        return np.asarray(self.parameter_jacobian(soil)[self.unknowns])
 
     def gaussian(self, soil: Array, gains: Array, covariance: Array) -> Gaussian:
         """Return the Gaussian with this covariance of coordinates and active gains."""
@@ -367,6 +367,11 @@ class Solution(NamedTuple, Generic[PointT, ModelT]):
     predicted_decrease: float
     evaluations: int
     termination: Termination
+
+    @property
+    def value(self) -> float:
+        """Value of the objective at `previous`; nan without a model."""
+        return math.nan if self.model is None else self.model.neg2_log_posterior
 
 
 class _Expansion(NamedTuple, Generic[PointT, ModelT]):

@@ -270,8 +270,7 @@ class Tracker:
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)
         fit = explanation.fit
-        settled = not self.mismatch(fit)
-        shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit), settled)
+        shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit))
         state = next_state(self._state, shown, end, self.settings.window)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
