@@ -24,24 +24,13 @@ _SOIL = len(PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class Gaussian:
-    """Mean and covariance of the soil's logarithms and the sensors' gains.
+    """Mean and covariance of the soil's logarithms and the sensors' gains."""
 
-    Attributes
-    ----------
-    soil : (6,)
-        In SI: the mean in the coordinates in which a window is nearest to Gaussian (see `parametrization`).
-    gains : (G,)
-        Relative errors of the sensors and standardised effect parameters.
-    covariance : (6 + G, 6 + G)
-        Of the soil's logarithms and the gains; rows of held ones are zero.
-    form : FormPosterior, optional
-        What the model's form leaves open; everything else is of the configured form.
-    """
-
+    # (6,) in SI: the mean in the coordinates in which a window is nearest to Gaussian (see `parametrization`)
     soil: Array
-    gains: Array
-    covariance: Array
-    form: FormPosterior | None = None
+    gains: Array  # (G,), relative errors of the sensors and standardised effect parameters
+    covariance: Array  # (6 + G, 6 + G), of the soil's logarithms and the gains; rows of held ones are zero
+    form: FormPosterior | None = None  # what the model's form leaves open; everything else is of the configured form
 
     @classmethod
     def of(cls, prior: SoilPrior, gain_std: Array) -> Gaussian:
@@ -74,21 +63,11 @@ class Gaussian:
 
 
 class PriorQuadratic(NamedTuple):
-    """-2 log prior about a point, by F coordinates and A active gains.
+    """-2 log prior about a point, by F coordinates and A active gains."""
 
-    Attributes
-    ----------
-    information : (F + A, F + A)
-        Half the Gauss-Newton Hessian.
-    gradient : (F + A,)
-        Half the gradient.
-    neg2_log_prior : float
-        The value.
-    """
-
-    information: Array
-    gradient: Array
-    neg2_log_prior: float
+    information: Array  # (F + A, F + A), half the Gauss-Newton Hessian
+    gradient: Array  # (F + A,), half the gradient
+    neg2_log_prior: float  # the value
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:

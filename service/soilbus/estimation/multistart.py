@@ -40,43 +40,21 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Outcome of one fit, of a constant soil.
+    """Outcome of one fit, of a constant soil."""
 
-    Attributes
-    ----------
-    mode
-        Soil and gains at the minimum, with the inverse of the information as covariance.
-    last_step, covariance
-        H^-1 g and H^-1 at `optimum`, by free coordinates and active gains.
-    sinkage : (W,)
-        Mean over the window by wheel [m], nan where unknown.
-    optimum
-        The last iterate at which the model was evaluated, with its linearisation: start of the next window.
-    neg2_log_posterior
-        Objective at the minimum: chi-square of residuals and prior, up to a constant.
-    neg2_log_evidence
-        -2 log of the data's likelihood with the parameters integrated out, up to the same constant.
-    rows
-        Residuals of the data.
-    iterations
-        Evaluations of the model.
-    termination
-        Why the descent ended.
-    form
-        What the model's form leaves open (`model_form`).
-    """
-
-    mode: Gaussian
-    last_step: Array
+    mode: Gaussian  # soil and gains at the minimum, with the inverse of the information as covariance
+    last_step: Array  # H^-1 g and H^-1 at `optimum`, by free coordinates and active gains
     covariance: Array
-    sinkage: Array
+    sinkage: Array  # (W,), mean over the window by wheel [m], nan where unknown
+    # the last iterate at which the model was evaluated, with its linearisation: start of the next window
     optimum: Optimum
-    neg2_log_posterior: float
+    neg2_log_posterior: float  # objective at the minimum: chi-square of residuals and prior, up to a constant
+    # -2 log of the data's likelihood with the parameters integrated out, up to the same constant
     neg2_log_evidence: float
-    rows: int
-    iterations: int
-    termination: Termination
-    form: FormPosterior | None = None
+    rows: int  # residuals of the data
+    iterations: int  # evaluations of the model
+    termination: Termination  # why the descent ended
+    form: FormPosterior | None = None  # what the model's form leaves open (`model_form`)
 
     @property
     def posterior(self) -> Posterior:

@@ -52,22 +52,12 @@ _K_C = PARAMETERS.index("k_c")
 
 @dataclass(frozen=True)
 class SoilClasses:
-    """Classes of soil in the coordinates of tyres of a mean width.
+    """Classes of soil in the coordinates of tyres of a mean width."""
 
-    Attributes
-    ----------
-    names
-        `unknown` is the last one.
-    centre, spread : (C, 6)
-        Mean and sd of each coordinate.
-    width
-        Mean tyre width [m].
-    """
-
-    names: tuple[str, ...]
-    centre: Array
+    names: tuple[str, ...]  # `unknown` is the last one
+    centre: Array  # (C, 6), mean and sd of each coordinate
     spread: Array
-    width: float
+    width: float  # mean tyre width [m]
 
     @classmethod
     def of_table(cls, width: float) -> SoilClasses:

@@ -64,25 +64,13 @@ class ChangePoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SoilState:
-    """State of the tracker: which soil the windows are of.
+    """State of the tracker: which soil the windows are of."""
 
-    Attributes
-    ----------
-    name, reason
-        The state, and why it is so.
-    transition
-        The last one: data before its end are of another soil.
-    change
-        A change point that no other soil explains yet.
-    mismatch
-        Whether the last fit was a mismatch.
-    """
-
-    name: TrackerState = TrackerState.STEADY
+    name: TrackerState = TrackerState.STEADY  # the state, and why it is so
     reason: Reason = Reason.ONE_SOIL
-    transition: Transition | None = None
-    change: ChangePoint | None = None
-    mismatch: bool = False
+    transition: Transition | None = None  # the last one: data before its end are of another soil
+    change: ChangePoint | None = None  # a change point that no other soil explains yet
+    mismatch: bool = False  # whether the last fit was a mismatch
 
     def spans_border(self, start: float) -> bool:
         """Return whether a window from `start` [s] on may still have data of another soil."""
@@ -91,25 +79,14 @@ class SoilState:
 
 
 class Shown(NamedTuple):
-    """What a window tells of a change of soil.
+    """What a window tells of a change of soil."""
 
-    Attributes
-    ----------
-    found
-        Why data before the end of `transition` are of another soil than those after it, or before `change` than those
-        after it; None where they are of the soil of the window before.
-    transition
-        The last transition, found now or before.
-    change
-        The change point, where there is one.
-    mismatch
-        Whether the fit exceeds its limit of chi-square.
-    """
-
+    # why data before the end of `transition` are of another soil than those after it, or before `change` than those
+    # after it; None where they are of the soil of the window before
     found: Reason | None
-    transition: Transition | None
-    change: ChangePoint | None
-    mismatch: bool
+    transition: Transition | None  # the last transition, found now or before
+    change: ChangePoint | None  # the change point, where there is one
+    mismatch: bool  # whether the fit exceeds its limit of chi-square
 
 
 def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:

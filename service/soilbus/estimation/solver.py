@@ -58,27 +58,13 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticModel:
-    """An objective's quadratic model at an iterate, by F free coordinates and A active gains.
+    """An objective's quadratic model at an iterate, by F free coordinates and A active gains."""
 
-    Attributes
-    ----------
-    information : (F + A, F + A)
-        Gauss-Newton Hessian, half that of -2 log posterior: data and prior.
-    prior_information : (F + A, F + A)
-        The prior's part of it.
-    gradient : (F + A,)
-        Half the gradient of -2 log posterior.
-    neg2_log_posterior : float
-        Value of the objective, up to a constant.
-    active_bounds : (E, F + A)
-        Outward directions of the bounds that the iterate is at: no step goes there.
-    """
-
-    information: Array
-    prior_information: Array
-    gradient: Array
-    neg2_log_posterior: float
-    active_bounds: Array
+    information: Array  # (F + A, F + A), Gauss-Newton Hessian, half that of -2 log posterior: data and prior
+    prior_information: Array  # (F + A, F + A), the prior's part of it
+    gradient: Array  # (F + A,), half the gradient of -2 log posterior
+    neg2_log_posterior: float  # value of the objective, up to a constant
+    active_bounds: Array  # (E, F + A), outward directions of the bounds that the iterate is at: no step goes there
 
     def step(self) -> Array | None:
         """Return the step (F + A,) to the model's minimum within the active bounds; None where there is no minimum.
@@ -343,30 +329,15 @@ class Minimisable(Protocol[PointT, ModelT]):
 
 
 class Solution(NamedTuple, Generic[PointT, ModelT]):
-    """The end of a descent.
+    """The end of a descent."""
 
-    Attributes
-    ----------
-    iterate
-        One full step after `previous`.
-    previous
-        The iterate at which `model` was evaluated: the last one where the descent converged, else that of least value.
-    model
-        The quadratic model there; None where it is not finite.
-    predicted_decrease
-        Of the objective by the full step.
-    evaluations
-        Of the model.
-    termination
-        Why it ended.
-    """
-
-    iterate: PointT
+    iterate: PointT  # one full step after `previous`
+    # the iterate at which `model` was evaluated: the last one where the descent converged, else that of least value
     previous: PointT
-    model: ModelT | None
-    predicted_decrease: float
-    evaluations: int
-    termination: Termination
+    model: ModelT | None  # the quadratic model there; None where it is not finite
+    predicted_decrease: float  # of the objective by the full step
+    evaluations: int  # of the model
+    termination: Termination  # why it ended
 
     @property
     def value(self) -> float:

@@ -60,80 +60,39 @@ _SOIL = len(PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Configuration of the tracker.
+    """Configuration of the tracker."""
 
-    Attributes
-    ----------
-    window : float
-        Length of a window [s].
-    min_speed : float
-        Ground speed [m/s] up to which instants are left out.
-    max_turn : float
-        Relative difference of an axle's rim speeds above which instants are left out.
-    drift : float
-        Sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time.
-    min_rows : int
-        Residuals below which a window is not fitted.
-    form : tuple of float
-        How far each of `model_form.FORM` may be from the configured model; () holds the form.
-    search_rate, search_burst : float
-        Evaluations of the model that searches may take, see `SearchBudget`.
-    hop : float
-        Time [s] from one window to the next.
-    instant : float
-        Length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins.
-    stated_noise : bool
-        Whether a first fit that leaves more than the stated noise is a mismatch: of rows without shaking or lateness.
-    """
-
-    window: float
-    min_speed: float
-    max_turn: float
+    window: float  # length of a window [s]
+    min_speed: float  # ground speed [m/s] up to which instants are left out
+    max_turn: float  # relative difference of an axle's rim speeds above which instants are left out
+    # sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time
     drift: float
-    min_rows: int = 15
+    min_rows: int = 15  # residuals below which a window is not fitted
+    # how far each of `model_form.FORM` may be from the configured model; () holds the form
     form: tuple[float, ...] = ()
-    search_rate: float = 4.0
+    search_rate: float = 4.0  # evaluations of the model that searches may take, see `SearchBudget`
     search_burst: float = 100.0
-    hop: float = 1.0
+    hop: float = 1.0  # time [s] from one window to the next
+    # length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins
     instant: float = ESTIMATOR.tracker.instant
+    # whether a first fit that leaves more than the stated noise is a mismatch: of rows without shaking or lateness
     stated_noise: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerOutput:
-    """Result of one window.
+    """Result of one window."""
 
-    Attributes
-    ----------
-    fit : Fit or None
-        None without enough residuals or where no fit ended.
-    mismatch : bool
-        Whether the model fails to describe the data.
-    state : TrackerState
-        Which soil the estimate is of.
-    since : float
-        Time [s] where the data that count begin.
-    standstill, turning : int
-        Instants left out.
-    search_ended : bool
-        Whether the budget of evaluations ended the search for a soil that describes the data.
-    reason : Reason
-        Why the state is so.
-    change : ChangePoint or None
-        The present change point.
-    prediction : Mapping of str to Share
-        By channel, how far the newest data are from what the windows before predict.
-    """
-
-    fit: Fit | None
-    mismatch: bool
-    state: TrackerState
-    since: float
-    standstill: int = 0
+    fit: Fit | None  # None without enough residuals or where no fit ended
+    mismatch: bool  # whether the model fails to describe the data
+    state: TrackerState  # which soil the estimate is of
+    since: float  # time [s] where the data that count begin
+    standstill: int = 0  # instants left out
     turning: int = 0
-    search_ended: bool = False
-    reason: Reason = Reason.ONE_SOIL
-    change: ChangePoint | None = None
+    search_ended: bool = False  # whether the budget of evaluations ended the search for a soil that describes the data
+    reason: Reason = Reason.ONE_SOIL  # why the state is so
+    change: ChangePoint | None = None  # the present change point
+    # by channel, how far the newest data are from what the windows before predict
     prediction: Mapping[str, Share] = field(default_factory=dict)
 
 

@@ -36,19 +36,11 @@ KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class VarianceComponents:
-    """Factors on the sensors' variances by kind, learned from `weight` windows.
-
-    Attributes
-    ----------
-    factor : Mapping of str to float
-        Of the kinds seen so far; 1 of every other.
-    weight : float
-        Windows that the factors rest on.
-    """
+    """Factors on the sensors' variances by kind, learned from `weight` windows."""
 
     options: VarianceOptions
-    factor: Mapping[str, float] = field(default_factory=dict)
-    weight: float = 0.0
+    factor: Mapping[str, float] = field(default_factory=dict)  # of the kinds seen so far; 1 of every other
+    weight: float = 0.0  # windows that the factors rest on
 
     def scaled(self, window: Window, rig: Rig) -> Window:
         """Return the window with the variances of sensors, and of loads that none measures, times their factors."""
