@@ -42,8 +42,8 @@ SIDE = np.array([-1.0, 1.0, 1.0, 1.0])
 OF_SQUARE = np.array([1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0, 1.0 / 4.0])
 """Variance over the square of the range: even between its ends (1/12), or either end as likely (1/4: a shear law)."""
 OPEN = 0.8
-"""Probability that the contact is of another form than the configured one, which is itself a published form.  By
-another wheel's formula, without sinkage sensors, 34 of 36 intervals of pressure hold; with 0.5 only 29."""
+"""Probability that the contact is of another form than the configured one, which is itself a published form.  With 0.5
+intervals of pressure are too narrow for another published wheel."""
 _SOIL = len(PARAMETERS)
 
 
