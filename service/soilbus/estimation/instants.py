@@ -56,13 +56,13 @@ def averaged(window: Window, end: float, length: float) -> Window:
 
 def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:
     """Return sums of the known rows from each start on, over a power of their number, for columns (N,) or (N, C)."""
-    values = np.concatenate([column.reshape(len(column), -1) for column in columns], axis=1)
+    values = np.concatenate([column.reshape(len(column), column[0].size) for column in columns], axis=1)
     known = np.isfinite(values)
     count = np.add.reduceat(known, starts, axis=0, dtype=float)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
     means, ends = total / np.where(count > 0.0, count, np.nan) ** power, 0
     parts: list[Array] = []
     for column in columns:
-        first, ends = ends, ends + column[:1].size
-        parts.append(means[:, first:ends].reshape(-1, *column.shape[1:]))
+        first, ends = ends, ends + column[0].size
+        parts.append(means[:, first:ends].reshape(len(means), *column.shape[1:]))
     return parts
