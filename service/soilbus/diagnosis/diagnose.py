@@ -130,6 +130,13 @@ def diagnose(
             records = with_noise_floor(records, base)
             full = FitCache(records, prior, options)
             base = full.fit(base.effects, [base.as_starts()])
+    if base is not None and any(record.training.computes_loads for record in records):
+        records = [
+            record.with_weights_at(fit.optimum.at, check.at)
+            for record, fit, check in zip(records, base.fits, base.checks, strict=True)
+        ]
+        full = FitCache(records, prior, options)
+        base = full.fit(base.effects, [base.as_starts()])
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
     thinned = FitCache([record.thinned(options.thinning) for record in records], prior, options)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.linearisation import Linearisation
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import SolverOptions
@@ -89,6 +90,11 @@ class Record:
         whole = None if self.whole is None else self.whole.with_effects(effects, free)
         return replace(self, training=training, held_out=held_out, joint_prior=joint_prior, whole=whole)
 
+    def with_weights_at(self, training: Linearisation, held_out: Linearisation) -> Record:
+        """The same with the weights of a model in which the parts were linearised; see `ObservationModel`."""
+        parts = [part.with_weights_at(at) for part, at in ((self.training, training), (self.held_out, held_out))]
+        return replace(self, training=parts[0], held_out=parts[1])
+
     def thinned(self, every: int) -> Record:
         """The same with each `every`-th instant; a table of few rows keeps all of them."""
         parts = self.training, self.held_out
@@ -134,7 +140,7 @@ def record_of(
         Where the recording has not enough usable instants.
     """
     problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed, max_turn)
-    problem = problem.with_own_stamps()
+    problem = problem.with_own_stamps().on_curves()
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)

@@ -56,6 +56,8 @@ _BY_INSTANT = (
     "_side_known", "standing_rows", "standing_latents",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
+_BY_INSTANT_IF_ANY = ("held_covariance", "_off_curve")
+"""The same of those that may be None."""
 
 
 def gain_names(rig: Rig) -> list[str]:
@@ -180,6 +182,8 @@ class Measurements:
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
         self._stand(standing_columns(window, rig), kept)
+        self.held_covariance: Array | None = None
+        self._off_curve: Array | None = None
         self._count()
 
     def _stand(self, columns: StandingColumns, kept: NDArray[np.intp]) -> None:
@@ -227,6 +231,27 @@ class Measurements:
         stamped.gain_std = stamped.sensor_std = np.concatenate([self.sensor_std[: first + 2], half])
         stamped.n_sensors = len(stamped.gain_names)
         return stamped
+
+    def on_curves(self) -> Self:
+        """The same with latents on smooth curves of what is measured, where two wheels share a torque.
+
+        Latents at their conditional optimum are uncorrelated with the residuals if these are weighed by their true
+        covariance.  Computed loads leave more open than they vary by, so the assumed one is several times too large:
+        the latents keep their sensors' noise, and the Jacobian taken there correlates with the residuals.  On the
+        channels' smooth curves it does not (regression calibration: Carroll et al. 2006, Measurement Error in Nonlinear
+        Models, ch. 4).
+        """
+        if not self.computes_sides:
+            return self
+        smooth = copy(self)
+        noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
+        of_draft, of_inertia = (
+            off_curve(self.t, *column)[:, None]
+            for column in ((self.draft, self.draft_var), (self.inertia, self.inertia_var))
+        )
+        of_computed = self.by_draft * of_draft + self.by_inertia * of_inertia
+        smooth._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
+        return smooth
 
     def _observe(self) -> None:
         """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""
@@ -312,6 +337,11 @@ class Measurements:
     def demand(self) -> Array:
         """Pull [N] (N,) for draft, slope and inertia."""
         return self.draft + self.inertia
+
+    @property
+    def computes_sides(self) -> bool:
+        """Whether two wheels share a torque, and nothing measures how they share their axle's load."""
+        return bool(self._sides)
 
     @property
     def computes_loads(self) -> bool:
@@ -421,6 +451,9 @@ class Measurements:
         part = copy(self)
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
+        for name in _BY_INSTANT_IF_ANY:
+            values = getattr(self, name)
+            setattr(part, name, None if values is None else values[instants])
         part._count()
         return part
 
@@ -468,6 +501,14 @@ def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tup
         if n > 1 and load[on, w].var() < 2.0 * variance[on, w].mean():  # half of it is noise
             load[on, w], variance[on, w] = load[on, w].mean(), variance[on, w].mean() / n
     return load, variance
+
+
+def off_curve(t: Array, value: Array, variance: Array) -> Array:
+    """By how much values (N,) at times t (N,) [s] differ from their smooth curve; 0 where their variance is."""
+    off, noisy = np.zeros(len(t)), variance > 0.0
+    if noisy.any():
+        off[noisy] = value[noisy] - curve_of(t[noisy], value[noisy], variance[noisy]).value
+    return off
 
 
 def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:

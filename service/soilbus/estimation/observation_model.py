@@ -15,11 +15,12 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 
     r <- r + A (x_measured / (1 + g_x) - x),    covariance  S = A V A' + R,    chi-square = sum r' S^-1 r.
 
-A load that is computed, not measured, stays at its prior, and its noise by draft and inertia is that of the balance.
-Only the difference left to right of two wheels on a load cell of the axle, with a torque sensor each, is fitted, as
-their torques measure it: torque and pull are curved in the load, so that unequal loads held equal bias the soil.
-Behind an open differential equal torques and unequal slips say how they differ: T_left(W_left) = T_right(W_right) fixes
-the difference, as T = 0 fixes the slip of a free wheel, and that row is used up.
+A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
+(`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
+two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
+pull are curved in the load, so that unequal loads held equal bias the soil.  Behind an open differential equal torques
+and unequal slips say how they differ: T_left(W_left) = T_right(W_right) fixes the difference, as T = 0 fixes the slip
+of a free wheel, and that row is used up.
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`, columns and
 rows as in `Layout`).  `observation_with_effects` adds effects to the wheel-soil model.
@@ -28,6 +29,7 @@ rows as in `Layout`).  `observation_with_effects` adds effects to the wheel-soil
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 from typing import Any, Self
 
@@ -206,14 +208,19 @@ class ObservationModel(Measurements):
         """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring; arguments as there."""
         if not self.computes_loads:
             return inverse_covariance(A, variance, row_var)
-        balance, of_loads = self.layout.balance, A[:, :, self._prior_only]
-        further = (of_loads * variance[:, None, self._prior_only]) @ of_loads.swapaxes(1, 2)
+        balance, held = self.layout.balance, self.held_covariance
+        further = self._by_load_noise(A, variance) if held is None else held.copy()
         for by, share in zip((self.by_inertia, self.by_draft), self._demand_shares, strict=True):
             of_loads, noise = (A @ by[:, :, None])[:, :, 0], (share * row_var[:, balance])[:, None]
             further += of_loads[:, :, None] * (noise * of_loads)[:, None]
             further[:, balance] += noise * of_loads
             further[:, :, balance] += noise * of_loads
         return inverse_covariance(A, np.where(self._prior_only, 0.0, variance), row_var, further)
+
+    def _by_load_noise(self, A: Array, variance: Array) -> Array:
+        """Covariance (N, m, m) of the residuals by what is left open of computed loads."""
+        of_loads = A[:, :, self._prior_only]
+        return np.asarray((of_loads * variance[:, None, self._prior_only]) @ of_loads.swapaxes(1, 2))
 
     @property
     def _demand_shares(self) -> tuple[Array, Array]:
@@ -223,6 +230,18 @@ class ObservationModel(Measurements):
             np.divide(v, self.demand_var, out=np.zeros(self.n), where=known) for v in (self.inertia_var, self.draft_var)
         )
         return next(shares), next(shares)
+
+    def with_weights_at(self, at: Linearisation) -> Self:
+        """The same measurements with the covariance that computed loads bring held as at a linearisation.
+
+        A computed load has no noise of its own that tells it from what it should be: A V A' of it is a weight.  Where
+        that followed the model, one of larger A would seem to fit better (generalised least squares: Carroll & Ruppert
+        1988, Transformation and Weighting in Regression, sect. 2.1).  The same where all loads are measured.
+        """
+        held = copy(self)
+        if self.computes_loads:
+            held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
+        return held
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
         """Observations (N, S) of loads left less right after a Newton step to equal torques.
@@ -375,7 +394,9 @@ class ObservationModel(Measurements):
         weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
             self.n, 1, at.by_latents.shape[1]
         )
-        noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
+        noise = self._off_curve
+        if noise is None:
+            noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
         new = at.corrected - noise - at.by_gain * gain_step[layout.latent_gains]
         new += self.standing_latents @ gain_step[layout.standing]
         if len(at.by_delay):
@@ -496,12 +517,14 @@ class ObservationModel(Measurements):
         return state_on(soil, angle.ravel(), slip.ravel(), radius, width, length)
 
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
-        """Latents at their measured values; entry angles solved at soil and gains (G,).
+        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).
 
         guess: entry angles (N, W) [rad] to begin with.
         """
         angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
         latents = Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
+        if self._off_curve is not None:
+            latents = self._latents(self.from_observed(self._measured - self._off_curve), angle)
         return self.with_entry_angles(latents, soil, gains)
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
