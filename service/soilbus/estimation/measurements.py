@@ -106,8 +106,9 @@ class Measurements:
         window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
-        yaw_rate = self._curves.of("yaw_rate")[0].at(window.t)[0]
-        straight, window = moving & ~in_turn, straightened(window, rig, yaw_rate)
+        straight = moving & ~in_turn
+        if np.isfinite(window.yaw_rate).any():
+            window = straightened(window, rig, self._curves.of("yaw_rate")[0].at(window.t)[0])
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
