@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.local_cubics import Instants, Series, curve_of, kept_noise, variance_of_one
+from soilbus.estimation.local_cubics import Instants, curve_of, faithful, kept_noise, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
@@ -44,7 +44,8 @@ def test_slow_channels_are_averaged_over_more_than_shaking_ones():
 def test_a_cubic_is_its_own_curve():
     cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 0.1])
     t = 0.02 * np.arange(100)
-    for curve in Series.of(t, cubic(t), np.full(len(t), 1e-6)):
+    smooth = curve_of(t, cubic(t), np.full(len(t), 1e-6))
+    for curve in (smooth, faithful(smooth, cubic(t))):
         now = np.linspace(0.1, 1.8, 40)
         for computed, true in zip(curve.at(now), (cubic, cubic.deriv(), cubic.deriv(2)), strict=True):
             assert computed == pytest.approx(true(now), abs=1e-5)

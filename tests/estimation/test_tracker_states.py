@@ -12,7 +12,7 @@ from soilbus.estimation.soil_state import ChangePoint, Reason, Shown, SoilState,
 LENGTH = 10.0
 SHARP, GRADUAL = Transition(20.0, 20.5, 1.3), Transition(20.0, 24.0, 1.3)
 CHANGE = ChangePoint(20.0, 1.5, ChangeStatistic(180, 31.0, 8.0))
-QUIET = Shown(None, None, None, mismatch=False, settled=True)
+QUIET = Shown(None, None, None, mismatch=False)
 
 
 def after(state: SoilState, shown: Shown, end: float) -> tuple[TrackerState, Reason]:
@@ -24,7 +24,7 @@ def after(state: SoilState, shown: Shown, end: float) -> tuple[TrackerState, Rea
     ("shown", "reason"),
     [
         (QUIET, Reason.ONE_SOIL),
-        (QUIET._replace(mismatch=True, settled=False), Reason.MISMATCH),
+        (QUIET._replace(mismatch=True), Reason.MISMATCH),
         (QUIET._replace(change=CHANGE), Reason.UNCONFIRMED),
     ],
 )
@@ -43,13 +43,13 @@ def test_a_change_with_too_few_data_is_suspect_and_remembered():
 @pytest.mark.parametrize("transition", [SHARP, GRADUAL])
 def test_a_border_is_over_as_soon_as_its_soil_fits(transition):
     found = QUIET._replace(found=Reason.TWO_SOILS, transition=transition)
-    assert after(SoilState(), found._replace(settled=False), 25.0) == (TrackerState.TRANSITION, Reason.UNSETTLED)
+    assert after(SoilState(), found._replace(mismatch=True), 25.0) == (TrackerState.TRANSITION, Reason.UNSETTLED)
     assert after(SoilState(), found, 25.0) == (TrackerState.NEW_SOIL, Reason.TWO_SOILS)
 
 
 def test_a_border_is_not_over_while_its_soil_does_not_fit_however_late():
     crossing = SoilState(TrackerState.TRANSITION, Reason.UNSETTLED, SHARP, mismatch=True)
-    unsettled = QUIET._replace(transition=SHARP, mismatch=True, settled=False)
+    unsettled = QUIET._replace(transition=SHARP, mismatch=True)
     for end in (22.0, 29.0, 45.0):
         assert after(crossing, unsettled, end) == (TrackerState.TRANSITION, Reason.UNSETTLED)
     # A window that fits and has no data before the border ends it.

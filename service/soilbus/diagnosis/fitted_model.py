@@ -263,7 +263,7 @@ class FittedModel:
 def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
     """The readings of one recording by channel and wheel."""
     problem, latents = held_out.problem, held_out.latents
-    standardised, _ = problem.standardised(held_out.at, fit.mode.gains)
+    standardised, _ = problem.standardised(held_out.at)
     measured = problem.readings
     modelled = measured - held_out.at.rows[:, RESIDUAL].reshape(measured.shape)
     slip = 1.0 - latents.ground_speed[:, None] / (problem.rig.radius * latents.speed)

@@ -124,18 +124,17 @@ class JointObjective:
 
     def together(self, models: Sequence[WindowModel]) -> JointModel:
         """The quadratic model of all recordings from that of each."""
-        information, of_prior, curvature = np.zeros((3, self.size, self.size))
+        information, of_prior = np.zeros((2, self.size, self.size))
         gradient = np.zeros(self.size)
         bounds = [np.zeros((len(model.active_bounds), self.size)) for model in models]
         for model, columns, outward in zip(models, self.columns, bounds, strict=True):
             block = columns[:, None], columns
             information[block] += model.information
             of_prior[block] += model.prior_information
-            curvature[block] += model.curvature
             gradient[columns] += model.gradient
             outward[:, columns] = model.active_bounds
         value = sum(model.neg2_log_posterior for model in models)
-        return JointModel(information, of_prior, curvature, gradient, value, np.vstack(bounds), tuple(models))
+        return JointModel(information, of_prior, gradient, value, np.vstack(bounds), tuple(models))
 
     def stepped(self, iterate: tuple[Iterate, ...], model: JointModel, step: Array) -> tuple[Iterate, ...]:
         """The iterate of each recording after a step of all coordinates, shortened at the first bound of any."""
@@ -247,7 +246,7 @@ def _fits_at(objective: JointObjective, end: Solution[tuple[Iterate, ...], Joint
         fit = fit_at(part, own)
         if fit is None:
             return None
-        mode = part.gaussian(fit.mode.soil, fit.mode.gains, covariance[columns[:, None], columns], own.previous.soil)
+        mode = part.gaussian(fit.mode.soil, fit.mode.gains, covariance[columns[:, None], columns])
         fits.append(replace(fit, mode=mode))
     penalty = end.model.neg2_log_evidence - sum(model.neg2_log_evidence for model in end.model.parts)
     return [replace(fit, neg2_log_evidence=fit.neg2_log_evidence + penalty / R) for fit in fits]

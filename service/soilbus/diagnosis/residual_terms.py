@@ -89,16 +89,14 @@ def _samples(
         column = record.training.row_channels.index(channel)
         training = record.training.with_effects(fitted.effects, fitted.free)
         yield (
-            _sample(training, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, column),
-            _sample(check.problem, check.at, check.latents, fit.mode.gains, column),
+            _sample(training, fit.optimum.at, fit.optimum.latents, column),
+            _sample(check.problem, check.at, check.latents, column),
         )
 
 
-def _sample(
-    problem: ObservationModelWithEffects, at: Linearisation, latents: Latents, gains: Array, column: int
-) -> _Sample:
+def _sample(problem: ObservationModelWithEffects, at: Linearisation, latents: Latents, column: int) -> _Sample:
     """Residuals of one column with the regressors of its wheels, their means where it has several."""
-    z, _ = problem.standardised(at, gains)
+    z, _ = problem.standardised(at)
     r, own = problem.rig.radius, problem.row_wheels[column]
     known = np.isfinite(z[:, column])
     raw = at.rows[:, 0].reshape(z.shape)[:, column]

@@ -85,7 +85,7 @@ def _tests(
 ) -> Iterator[tuple[float, Disagreement]]:
     """The tests of one recording, in standard deviations: mean by region, and scatter, of each channel."""
     problem = check.problem
-    z, slopes = problem.standardised(check.at, gaussian.gains)
+    z, slopes = problem.standardised(check.at)
     slopes = slopes * np.concatenate([gaussian.soil, np.ones(len(gaussian.gains))])
     raw = check.at.rows[:, 0].reshape(z.shape)
     slip = 1.0 - check.latents.ground_speed[:, None] / (problem.rig.radius * check.latents.speed)

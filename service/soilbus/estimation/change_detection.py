@@ -51,27 +51,11 @@ class ChangeStatistic(NamedTuple):
 def change_statistic(
     objective: Objective, joint_prior: Gaussian, iterate: Iterate, at: Linearisation, first: int, false_alarms: float
 ) -> ChangeStatistic:
-    """Return the likeliest beginning of another soil among the instants from `first` on.
+    """Return the likeliest beginning of another soil among the instants from index `first` on.
 
-    Parameters
-    ----------
-    objective : Objective
-        Of the window.
-    joint_prior : Gaussian
-        Prediction of soil and gains by earlier data.
-    iterate : Iterate
-        Where the residuals are linearised: the prediction's mean.
-    at : Linearisation
-        The residuals there.
-    first : int
-        Index of the first instant that may be on another soil.
-    false_alarms : float
-        Probability that the noise of one window passes the threshold.
-
-    Returns
-    -------
-    ChangeStatistic
-        The ratio is an upper bound where that does not pass the threshold, to save time.
+    joint_prior predicts soil and gains by earlier data; `at` holds the residuals at its mean, `iterate`. false_alarms
+    is the probability that the noise of one window passes the threshold.  Where the ratio does not pass it, it is an
+    upper bound, to save time.
     """
     n, m = at.by_latents.shape[:2]
     if first >= n:
@@ -162,21 +146,9 @@ class Transition(NamedTuple):
 
 
 def without_transition(window: Window, transition: Transition, ahead: Array) -> Window:
-    """Return the window without the wheels' measurements during a transition.
+    """Return the window with nan in torque, load, speed and sinkage of wheels between the soils; ahead as `Rig.ahead`.
 
-    Parameters
-    ----------
-    window : Window
-        The whole window.
-    transition : Transition
-        Before its `begin` all data are of the first soil; a wheel's data count again when it has arrived.
-    ahead : Array
-        As `Rig.ahead` (W,).
-
-    Returns
-    -------
-    Window
-        With nan in torque, load, speed and sinkage of wheels between the soils.
+    Before its `begin` all data are of the first soil; a wheel's data count again when it has arrived.
     """
     arrived = transition.end + (1.0 - ahead) * transition.lag
     between = (window.t[:, None] >= transition.begin) & (window.t[:, None] < arrived)

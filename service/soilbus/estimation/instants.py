@@ -23,21 +23,9 @@ _QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
 
 
 def averaged(window: Window, end: float, length: float) -> Window:
-    """Return the window with the means of its bins over instants of this length [s], counted back from `end` [s].
+    """Return the window with means of its bins over instants of this length [s], counted back from `end` [s].
 
-    Parameters
-    ----------
-    window : Window
-        Bin means and variances; nan where unknown.
-    end : float
-        Time [s] at which the last instant ends.
-    length : float
-        Of an instant; 0 returns the window itself.
-
-    Returns
-    -------
-    Window
-        A value is known where one of its bins is.
+    A value is known where one of its bins is; length 0 returns the window itself.
     """
     if not length or not len(window.t):
         return window
@@ -50,29 +38,31 @@ def averaged(window: Window, end: float, length: float) -> Window:
     if given is not None:
         values += [given.torque, given.value, given.by_inertia, given.by_draft]
         variances += [given.torque_var, given.variance]
-    value, variance = _means(values, starts, 1), _means(variances, starts, 2)
-    n = len(_QUANTITIES)
+    means = _means(values, starts, 1), _means(variances, starts, 2)
+    value, variance = (dict(zip(_QUANTITIES, part, strict=False)) for part in means)
     if given is not None:
-        torque, latents, by_inertia, by_draft = value[n:]
-        given = type(given)(torque, variance[n], latents, variance[n + 1], by_inertia, by_draft)
+        (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
+        given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)
     direction, each = window.direction, np.diff(starts, append=len(window.t))
     return replace(
         window,
         t=np.add.reduceat(window.t - end, starts) / each + end,
-        variance=dict(zip(_QUANTITIES, variance, strict=False)),
+        variance=variance,
         observations=given,
         direction=np.sign(np.add.reduceat(direction, starts)) if len(direction) else direction,
-        **dict(zip(_QUANTITIES, value, strict=False)),  # type: ignore[arg-type]
+        **value,  # type: ignore[arg-type]
     )
 
 
 def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:
     """Return sums of the known rows from each start on, over a power of their number, for columns (N,) or (N, C)."""
-    values = np.column_stack(columns)
+    values = np.concatenate([column.reshape(len(column), column[0].size) for column in columns], axis=1)
     known = np.isfinite(values)
-    count = np.add.reduceat(known.astype(float), starts, axis=0)
+    count = np.add.reduceat(known, starts, axis=0, dtype=float)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
-    means = np.where(count > 0.0, total / np.maximum(count, 1.0) ** power, np.nan)
-    ends = np.cumsum([1 if column.ndim == 1 else column.shape[1] for column in columns])
-    parts = np.split(means, ends[:-1], axis=1)
-    return [part[:, 0] if column.ndim == 1 else part for part, column in zip(parts, columns, strict=True)]
+    means, ends = total / np.where(count > 0.0, count, np.nan) ** power, 0
+    parts: list[Array] = []
+    for column in columns:
+        first, ends = ends, ends + column[0].size
+        parts.append(means[:, first:ends].reshape(len(means), *column.shape[1:]))
+    return parts

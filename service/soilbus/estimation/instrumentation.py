@@ -98,29 +98,15 @@ class Observations(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Instrumentation:
-    """What is measured of the W wheels of a rig.
+    """What is measured of the W wheels of a rig."""
 
-    Attributes
-    ----------
-    torque, speed, load
-        W rows of each.
-    couplings
-        Differentials, and the shaft between the axles.
-    ratio
-        (W,), turns of a motor of both axles for one of the wheel.
-    load_noise
-        Relative sd of a load that is not measured, in a bin.
-    motors
-        Those that drive several wheels.
-    """
-
-    torque: tuple[Row, ...]
+    torque: tuple[Row, ...]  # W rows of each
     speed: tuple[Row, ...]
     load: tuple[Row, ...]
-    couplings: tuple[Coupling, ...]
-    ratio: Array
-    load_noise: float
-    motors: tuple[Group, ...] = ()
+    couplings: tuple[Coupling, ...]  # differentials, and the shaft between the axles
+    ratio: Array  # (W,), turns of a motor of both axles for one of the wheel
+    load_noise: float  # relative sd of a load that is not measured, in a bin
+    motors: tuple[Group, ...] = ()  # those that drive several wheels
 
     @property
     def torque_matrix(self) -> Array:
@@ -223,20 +209,10 @@ def unit(n_wheels: int, wheel: int) -> tuple[float, ...]:
 
 
 def completed(window: Window, rig: Rig) -> Window:
-    """Return a forward window with a torque, speed and load of every wheel.
+    """Return a forward window (`forward`) with a torque, speed and load of every wheel.
 
-    Parameters
-    ----------
-    window : Window
-        From `forward`: channels as measured, each in its own column (`rows_of`).
-    rig : Rig
-        With its instrumentation.
-
-    Returns
-    -------
-    Window
-        Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
-        rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
+    Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
+    rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
     """
     window = _of_vehicle(window, rig)
     given = rig.instrumentation

@@ -25,29 +25,10 @@ def prior_from_last_run(
     elapsed: float,
     correlation_time: float = ESTIMATOR.tracker.gain_correlation_time,
 ) -> Gaussian:
-    """Return the joint prior of a run: the soil's prior, and the last run's gains drawn back to theirs.
+    """Return the joint prior of a run: the soil's, and the gains `gaussian` of the last run, `elapsed` seconds ago.
 
-    Parameters
-    ----------
-    gaussian : Gaussian
-        Posterior at the end of the last run.
-    soil : SoilPrior
-        Prior of the soil; the vehicle may stand on another one now.
-    gain_std : Array
-        Prior sd of the gains (G,).
-    elapsed : float
-        Time since then [s].
-    correlation_time : float
-        [s], `TrackerOptions.gain_correlation_time`.
-
-    Returns
-    -------
-    Gaussian
-        Gains k g with variance k^2 var + (1 - k^2) gain_std^2, k = exp(-elapsed / correlation_time).
-
-    References
-    ----------
-    Gain errors as a stationary process: Uhlenbeck & Ornstein 1930, Phys. Rev. 36, 823.
+    Gain errors are a stationary process (Uhlenbeck & Ornstein 1930, Phys. Rev. 36, 823): a gain g is drawn back to k g
+    with variance k^2 var + (1 - k^2) gain_std^2, k = exp(-elapsed / correlation_time).
     """
     kept = math.exp(-elapsed / correlation_time) * (gain_std > 0.0)
     covariance = np.zeros_like(gaussian.covariance)

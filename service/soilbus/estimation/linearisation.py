@@ -138,28 +138,24 @@ class Optimum:
 class Response(NamedTuple):
     """Drawbar pull [N], torque [N m] and sinkage [m], value (3, N, W), of wheels that carry the latent loads.
 
-    by_load, by_speed, by_ground (3, N, W), by_soil (3, 6, N, W) and by_effects (3, P, N, W)
-    are their derivatives by the latents, the soil parameters and the effect parameters.
-    load_by_slip (N, W), load_by_soil (6, N, W), load_by_effects (P, N, W) and load_slope
-    (N, W) are derivatives of the load at the latent entry angle, the last by that angle;
-    load_residual (N, W) [N] is the latent load less the model's.  extra_pull (N,) [N] is the
-    pull that effects ask of the wheels beyond the measured demand; extra_pull_by_effects
-    (P, N) its derivatives.
+    The next are its derivatives by latents, soil and effect parameters, with the load held.  Those of the load are at
+    the latent entry angle; load_residual [N] is the latent load less the model's. extra_pull [N] is the pull that
+    effects ask of the wheels beyond the measured demand.
     """
 
     value: Array
-    by_load: Array
+    by_load: Array  # (3, N, W), as the next two
     by_speed: Array
     by_ground: Array
-    by_soil: Array
-    load_by_slip: Array
-    load_by_soil: Array
-    load_by_effects: Array
-    load_slope: Array
+    by_soil: Array  # (3, 6, N, W)
+    load_by_slip: Array  # (N, W)
+    load_by_soil: Array  # (6, N, W)
+    load_by_effects: Array  # (P, N, W)
+    load_slope: Array  # (N, W), by the entry angle
     load_residual: Array
-    by_effects: Array
-    extra_pull: Array
-    extra_pull_by_effects: Array
+    by_effects: Array  # (3, P, N, W)
+    extra_pull: Array  # (N,)
+    extra_pull_by_effects: Array  # (P, N)
 
     def rolling(self, free: NDArray[np.bool_]) -> Response:
         """The response with the slips of free wheels (mask (W,)) eliminated by T = 0, to first order.

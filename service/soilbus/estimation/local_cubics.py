@@ -69,31 +69,8 @@ class Curve(NamedTuple):
         return value, slope, second
 
 
-class Series(NamedTuple):
-    """A channel's curve of least risk (slopes, low passes) and one with less bias (delays, accelerations)."""
-
-    smooth: Curve
-    faithful: Curve
-
-    @classmethod
-    def of(cls, t: Array, value: Array, variance: Array) -> Series:
-        """Both curves of a series, parameters as `curve_of`."""
-        smooth = curve_of(t, value, variance)
-        return cls(smooth, faithful(smooth, value))
-
-    def later(self, by: float) -> Series:
-        """The same, later by `by` [s]."""
-        return Series(*(curve._replace(t=curve.t + by) for curve in self))
-
-
 def curve_of(t: Array, value: Array, variance: Array) -> Curve:
-    """The curve of least estimated risk.
-
-    Parameters
-    ----------
-    t, value, variance : Array
-        Ascending times [s], samples and their noise variances, (K,).
-    """
+    """The curve of least estimated risk through samples (K,) at ascending times [s] with these noise variances."""
     best, least = 0, 2.0  # of no smoothing w0 = 1
     _, runs = _runs(t)
     weight = 1.0 / np.where(variance > 0.0, variance, np.inf)
@@ -112,8 +89,7 @@ def curve_of(t: Array, value: Array, variance: Array) -> Curve:
 def faithful(curve: Curve, value: Array) -> Curve:
     """A curve of the samples (K,) with half the half width: 1/16 of the bias, sqrt(2) times the noise.
 
-    A delay shows in how the curve moves.  The curve of least risk has about as much bias as
-    noise, and its bias would count as delay.
+    The curve of least risk has about as much bias as noise, and its bias would count as acceleration.
     """
     return _curve(curve.t, value, max(curve.half_width // 2, HALF_WIDTHS[0])) if curve.half_width else curve
 

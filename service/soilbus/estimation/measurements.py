@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
-from soilbus.estimation.local_cubics import Curve, Instants, Series, curve_of, kept_noise
+from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
 from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -106,8 +106,9 @@ class Measurements:
         window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
-        yaw_rate = self._curves.of("yaw_rate")[0].smooth.at(window.t)[0]
-        straight, window = moving & ~in_turn, straightened(window, rig, yaw_rate)
+        straight = moving & ~in_turn
+        if np.isfinite(window.yaw_rate).any():
+            window = straightened(window, rig, self._curves.of("yaw_rate")[0].at(window.t)[0])
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
@@ -206,7 +207,7 @@ class Measurements:
             return self
         window = self._curves.window
         smooth = {
-            quantity: np.stack([curve.smooth.at(window.t)[0] for curve in self._curves.of(quantity)], axis=1)
+            quantity: np.stack([curve.at(window.t)[0] for curve in self._curves.of(quantity)], axis=1)
             for quantity in ("torque", "load", "speed", "ground_speed", "draft", "acceleration")
         }
         shaped: dict[str, Any] = {
@@ -300,8 +301,8 @@ class Measurements:
         self.n = len(self.t)
         self._n_known = int(self._known.sum())
         self._missing = None if self._n_known == self._known.size else ~self._known
-        self._radius, self._width = np.tile(self.rig.radius, self.n), np.tile(self.rig.width, self.n)
-        self._length = 0.0 if self.rig.lengths is None else np.tile(self.rig.lengths, self.n)
+        length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
+        self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""
@@ -410,7 +411,7 @@ class Measurements:
         """Time [s] between samples of a quantity, the longest of its channels; 0 where only bins are known."""
         names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
         curves = self._curves.window.curves
-        return max((curves[name].smooth.step for name in names if name in curves), default=0.0)
+        return max((curves[name].step for name in names if name in curves), default=0.0)
 
     def shifted(self, quantity: str, column: int, curve: Curve, delay: float, tau: float) -> Array:
         """Return by how much a column of a quantity (N,) changes where a delay and a low pass [s] are taken out."""
@@ -428,7 +429,7 @@ class Measurements:
         self, quantity: str, column: int, curve: Curve, delay: float, tau: float, low_pass: float = 0.0
     ) -> float:
         """Return the factor on what is beside a curve, with which a shift [s] keeps the noise of instants."""
-        of_value = self._curves.of(quantity)[column].smooth.half_width
+        of_value = self._curves.of(quantity)[column].half_width
         if not (curve.half_width and of_value and self.n > 1):
             return 1.0
         length = float(np.median(np.diff(self._curves.window.t)))
@@ -464,9 +465,9 @@ class Curves:
     def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
         self.window = window
         self._wheels = wheels
-        self._cache: dict[str, list[Series]] = {}
+        self._cache: dict[str, list[Curve]] = {}
 
-    def of(self, quantity: str) -> list[Series]:
+    def of(self, quantity: str) -> list[Curve]:
         """The curves of a quantity: one for each wheel, or one for the vehicle."""
         if quantity not in self._cache:
             values, variances = getattr(self.window, quantity), self.window.variance[quantity]
@@ -483,9 +484,9 @@ class Curves:
         values = getattr(self.window, quantity)
         return 1 if values.ndim == 1 else int(values.shape[1])
 
-    def _curve(self, values: Array, variance: Array) -> Series:
+    def _curve(self, values: Array, variance: Array) -> Curve:
         known = np.isfinite(values) & np.isfinite(variance)
-        return Series.of(self.window.t[known], values[known], variance[known])
+        return curve_of(self.window.t[known], values[known], variance[known])
 
 
 def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -529,25 +530,14 @@ def wheel_rotation(t: Array, speed: Array) -> Array:
 def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:
     """Acceleration as the slope of the ground speed's smooth curve (`local_cubics`), and its variance.
 
-    var a = max(mean var V, mean (V - curve)^2) * sum of squared weights of the slope,  means over the cubic's samples
+        var a = max(mean var V, mean (V - curve)^2) * sum of squared weights of the slope,  over a cubic's samples
 
-    Parameters
-    ----------
-    t, speed, variance : Array
-        Times [s], ground speeds [m/s] and variances of these, (N,).
-
-    Returns
-    -------
-    acceleration, variance : Array
-        [m/s^2] and its square, (N,); 0 and 1 of fewer than three speeds.
-
-    Notes
-    -----
-    The misfit counts as noise where it is more, so that harsh driving does not pass for precise data.
+    Both (N,); 0 and 1 of fewer than three speeds.  The misfit counts as noise where it is more, so that harsh driving
+    does not pass for precise data.
     """
     if len(t) < 3:
         return np.zeros(len(t)), np.full(len(t), 1.0)
-    curve = Series.of(t, speed, variance).faithful
+    curve = faithful(curve_of(t, speed, variance), speed)
     near = np.ones(2 * max(curve.half_width, 1) + 1)
     spread, noise = (np.convolve(a, near, "same") for a in ((speed - curve.value) ** 2, variance))
     count = np.convolve(np.ones(len(t)), near, "same")

@@ -24,13 +24,14 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import solve_with_inverse
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.variance_components import block_sums
 from soilbus.terra.wheel import WheelModel
 
 if TYPE_CHECKING:
     from soilbus.estimation.multistart import Fit
-    from soilbus.estimation.solver import Objective
 
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
@@ -41,8 +42,8 @@ SIDE = np.array([-1.0, 1.0, 1.0, 1.0])
 OF_SQUARE = np.array([1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0, 1.0 / 4.0])
 """Variance over the square of the range: even between its ends (1/12), or either end as likely (1/4: a shear law)."""
 OPEN = 0.8
-"""Probability that the contact is of another form than the configured one, which is itself a published form.  By
-another wheel's formula, without sinkage sensors, 34 of 36 intervals of pressure hold; with 0.5 only 29."""
+"""Probability that the contact is of another form than the configured one, which is itself a published form.  With 0.5
+intervals of pressure are too narrow for another published wheel."""
 _SOIL = len(PARAMETERS)
 
 
@@ -111,60 +112,47 @@ def with_form_step(model: WheelModel, step: Array) -> WheelModel:
 
 
 def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> FormPosterior:
-    """Return the posterior of the form parameters after a window's fit.
+    """Return the posterior of the form parameters after a window's fit on the configured form.
 
-    Parameters
-    ----------
-    objective, fit
-        Of the window, on the configured form; converged.
-    prior
-        Of the form, with how the prior of soil and gains depends on it.
-
-    Returns
-    -------
-    FormPosterior
-        The prior itself where every form parameter is held or the normal equations are singular.
+    The prior itself where every form parameter is held or the normal equations are singular.
     """
     problem, optimum = objective.problem, fit.optimum
-    approximation = objective.approximation_at(optimum)
     free = np.flatnonzero(np.diag(prior.covariance) > 0.0)
-    if approximation is None or not len(free):
+    if not len(free):
         return prior
     by_form, weighed = problem.by_form(optimum)
     by_form, weighed = by_form[:, free], weighed[:, free]
-    prior_by_form, precision, off = objective.prior_factor.jacobian_by_mean(
-        optimum.soil, optimum.gains, prior.by_form[:, free]
-    )
+    prior_by_form, of_prior = -prior.by_form[np.ix_(objective.unknowns, free)], objective.prior_precision
+    off = objective.prior_residuals(optimum.soil, optimum.gains)
     columns = weighed.T @ optimum.at.rows
-    cross = (columns @ approximation.directions) + prior_by_form.T @ precision @ objective.prior_jacobian(optimum)
-    gradient = columns[:, 0] + prior_by_form.T @ (precision @ off)
-    information = by_form.T @ weighed + prior_by_form.T @ precision @ prior_by_form
-    own = solve_with_inverse(prior.covariance[np.ix_(free, free)], prior.mean[free])
-    if own is None:
-        return prior
-    of_gradient, of_information = approximation.explained(cross)
-    information = information - of_information
-    discount = _discount(objective, fit, by_form, cross, information) * problem.options.posterior.form_discount
-    found = solve_with_inverse(information / discount + own[1], own[0] + (of_gradient - gradient) / discount)
+    directions = objective.directions(Iterate.of(optimum))
+    cross = columns @ directions + prior_by_form.T @ of_prior @ objective.prior_jacobian(optimum.soil)
+    gradient = columns[:, 0] + prior_by_form.T @ (of_prior @ off)
+    information = by_form.T @ weighed + prior_by_form.T @ of_prior @ prior_by_form
+    precision = 1.0 / np.diag(prior.covariance)[free]  # of independent parameters
+    following = fit.covariance @ cross.T  # minus the derivatives of coordinates and gains by the form
+    information = information - cross @ following
+    of_gradient = cross @ fit.last_step
+    scores = ((by_form - optimum.at.rows @ directions @ following) * optimum.at.weighed[:, :1]).reshape(
+        problem.n, -1, len(free)
+    )
+    discount = _discount(scores.sum(axis=1), information, problem) * problem.options.posterior.form_discount
+    found = solve_with_inverse(
+        information / discount + np.diag(precision), precision * prior.mean[free] + (of_gradient - gradient) / discount
+    )
     if found is None:
         return prior
     sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
-    sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ approximation.covariance @ cross.T
+    sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ following
     mean[free], covariance[np.ix_(free, free)] = found
     return FormPosterior(sensitivity, mean, covariance)
 
 
-def _discount(objective: Objective, fit: Fit, by_form: Array, cross: Array, information: Array) -> float:
-    """Return how much more the scores of seconds vary than the information (P, P) of the form says; 1 at least.
+def _discount(scores: Array, information: Array, problem: ObservationModel) -> float:
+    """Return how much more the scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least.
 
     Scores are those of the form with soil and gains eliminated (covariance by blocks: Newey & West 1987).
     """
-    problem, optimum = objective.problem, fit.optimum
-    approximation = objective.approximation_at(optimum)
-    assert approximation is not None
-    n, m = optimum.at.by_latents.shape[:2]
-    rows = by_form - optimum.at.rows @ approximation.directions @ approximation.covariance @ cross.T
-    scores = (rows * optimum.at.weighed[:, :1]).reshape(n, m, -1).sum(axis=1)
     blocks = block_sums(scores, problem.t, problem.options.variance.block)
     variance = np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0]
     return max(float(np.trace(variance)) / len(information), 1.0)

@@ -40,39 +40,21 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Outcome of one fit, of a constant soil.
+    """Outcome of one fit, of a constant soil."""
 
-    Attributes
-    ----------
-    mode
-        Soil and gains at the minimum, with the inverse of the information as covariance.
-    sinkage : (W,)
-        Mean over the window by wheel [m], nan where unknown.
-    optimum
-        The last iterate at which the model was evaluated, with its linearisation: start of the next window.
-    neg2_log_posterior
-        Objective at the minimum: chi-square of residuals and prior, up to a constant.
-    neg2_log_evidence
-        -2 log of the data's likelihood with the parameters integrated out, up to the same constant.
-    rows
-        Residuals of the data.
-    iterations
-        Evaluations of the model.
-    termination
-        Why the descent ended.
-    form
-        What the model's form leaves open (`model_form`).
-    """
-
-    mode: Gaussian
-    sinkage: Array
+    mode: Gaussian  # soil and gains at the minimum, with the inverse of the information as covariance
+    last_step: Array  # H^-1 g and H^-1 at `optimum`, by free coordinates and active gains
+    covariance: Array
+    sinkage: Array  # (W,), mean over the window by wheel [m], nan where unknown
+    # the last iterate at which the model was evaluated, with its linearisation: start of the next window
     optimum: Optimum
-    neg2_log_posterior: float
+    neg2_log_posterior: float  # objective at the minimum: chi-square of residuals and prior, up to a constant
+    # -2 log of the data's likelihood with the parameters integrated out, up to the same constant
     neg2_log_evidence: float
-    rows: int
-    iterations: int
-    termination: Termination
-    form: FormPosterior | None = None
+    rows: int  # residuals of the data
+    iterations: int  # evaluations of the model
+    termination: Termination  # why the descent ended
+    form: FormPosterior | None = None  # what the model's form leaves open (`model_form`)
 
     @property
     def posterior(self) -> Posterior:
@@ -98,19 +80,8 @@ class Fit:
 def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Fit | None:
     """Return the posterior of a window of which only the prior is known, from several starts.
 
-    Parameters
-    ----------
-    problem
-        The window.
-    prior
-        Of the soil.
-    joint_prior
-        Posterior of earlier windows, in place of the prior.
-
-    Returns
-    -------
-    Fit or None
-        None if no descent ends at a finite optimum.
+    joint_prior: posterior of earlier windows, in place of the soil's prior.  None where no descent ends at a finite
+    optimum.
     """
     joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
     options, objective = problem.options.search, Objective(problem, prior, joint_prior)
@@ -172,15 +143,15 @@ def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
 
-def _search(thin: Objective) -> list[_End]:
+def _search(thin: Objective) -> list[Solution[Iterate, WindowModel]]:
     """Ends of descents of the soil alone on a few instants, the best first.
 
     Descents from the starts in turn; two that meet at a plausible objective end the search.
     """
-    options, ends = thin.options, list[_End]()
+    options, ends = thin.options, list[Solution[Iterate, WindowModel]]()
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
-        end = _end_from(thin, np.asarray(start))
-        if end is None:
+        end = minimise(thin, thin.start(np.asarray(start)), options.soil_alone)
+        if end.model is None:
             continue
         met = any(abs(end.value - other.value) < options.same_end * other.value for other in ends)
         ends.append(end)
@@ -189,26 +160,9 @@ def _search(thin: Objective) -> list[_End]:
     return sorted(ends, key=lambda end: end.value)
 
 
-class _End(NamedTuple):
-    """Where a descent on a few instants ended: soil (6,), gains (G,), objective there, and evaluations of the model."""
-
-    soil: Array
-    gains: Array
-    value: float
-    evaluations: int
-
-
-def _end_from(thin: Objective, soil: Array) -> _End | None:
-    """The end of a descent on a few instants from a soil (6,); None where the numbers are not finite."""
-    end = minimise(thin, thin.start(soil), thin.options.soil_alone)
-    if end.model is None:
-        return None
-    return _End(end.previous.soil, end.previous.gains, end.model.neg2_log_posterior, end.evaluations)
-
-
-def _joint_fit(objective: Objective, end: _End) -> Fit | None:
+def _joint_fit(objective: Objective, end: Solution[Iterate, WindowModel]) -> Fit | None:
     """The fit to all instants from an end of the search; None where the numbers are not finite."""
-    options, start = objective.options, objective.start(end.soil, gains=end.gains)
+    options, start = objective.options, objective.start(end.previous.soil, gains=end.previous.gains)
     descent = options.cold
     if not end.value < options.implausible * options.thinned:
         descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
@@ -225,7 +179,9 @@ def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluation
     is_converged, previous = end.termination is Termination.STEP, end.previous
     last_decrease = end.predicted_decrease if is_converged else 0.0
     return Fit(
-        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1], previous.soil),
+        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1]),
+        last_step=inverse[0],
+        covariance=inverse[1],
         sinkage=objective.problem.mean_sinkage(end.iterate.as_soil(), end.iterate.gains, end.iterate.latents),
         optimum=Optimum(objective.problem.t, previous.soil, previous.gains, previous.latents, end.model.linearisation),
         neg2_log_posterior=end.model.neg2_log_posterior - last_decrease,

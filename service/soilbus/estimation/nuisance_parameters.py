@@ -58,25 +58,10 @@ def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
 
 
 def active_at(effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int) -> list[Active]:
-    """Return the effects with their values at standardised parameters (P,).
+    """Return the effects, in the catalogue's order, with their values at standardised parameters (P,).
 
-    Effects without any influence at these values are left out, to save time.
-
-    Parameters
-    ----------
-    effects : Sequence of Effect
-        In the order of the catalogue.
-    free : Sequence of Free
-        Their P parameters.
-    standardised : Array
-        (P,), (value - prior value) / prior sd.
-    n_wheels : int
-        W.
-
-    Returns
-    -------
-    list of Active
-        Values are floats, or (W,) where each wheel has its own.
+    Values are floats, or (W,) where each wheel has its own.  Effects without any influence at these values are left
+    out, to save time.
     """
     values = _values(effects, free, [f.at(u) for f, u in zip(free, standardised.tolist(), strict=True)], n_wheels)
     return [Active(e, values[e.name]) for e in effects if not _absent(e, values[e.name])]

@@ -51,7 +51,6 @@ from soilbus.estimation.linearisation import (
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import (
     INPUTS,
     MAX_ENTRY_ANGLE,
@@ -59,6 +58,7 @@ from soilbus.terra.wheel import (
     WheelModel,
     WheelState,
     sinkage,
+    state_on,
     wheel_forces_and_derivatives,
 )
 
@@ -205,15 +205,7 @@ class ObservationModel(Measurements):
         )
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
-        """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring.
-
-        Parameters
-        ----------
-        A : Array
-            Derivatives of the residuals by the observations (N, m, 2 W + 1).
-        variance, row_var : Array
-            From `variances`.
-        """
+        """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring; arguments as there."""
         if not self.computes_loads:
             return inverse_covariance(A, variance, row_var)
         balance, held = self.layout.balance, self.held_covariance
@@ -383,17 +375,7 @@ class ObservationModel(Measurements):
         return None
 
     def delay_residuals(self, delay: DelayTerms | None, A: Array, gains: Array) -> Array:
-        """Part (N, m) of the residuals due to delays.
-
-        Parameters
-        ----------
-        delay : DelayTerms or None
-            From `delay_terms`.
-        A : Array
-            Derivatives of the residuals by the latents (N, m, 2 W + 1).
-        gains : Array
-            Sensor gains, then effect parameters (G,).
-        """
+        """Part (N, m) of the residuals due to delays; A (N, m, 2 W + 1): their derivatives by the latents."""
         residual, layout = np.zeros(A.shape[:2]), self.layout
         if delay is not None:
             gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
@@ -404,16 +386,9 @@ class ObservationModel(Measurements):
         return residual
 
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
-        """Latents at their conditional optimum, or on their curves, after a step of soil and gains: the linear model.
+        """Latents at their conditional optimum after a step of the soil (6,) in SI and of gains (G,): the linear model.
 
-        Parameters
-        ----------
-        at : Linearisation
-            With derivatives by the sensor gains, at `latents`.
-        latents : Latents
-            Where `at` was linearised.
-        soil_step, gain_step : Array
-            (6,) in SI and (G,).
+        `at` is the linearisation at `latents`, with derivatives by the sensor gains.
         """
         layout = self.layout
         weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
@@ -450,14 +425,12 @@ class ObservationModel(Measurements):
         """Entry angles (N, W) [rad] after a step (6,) of the soil and (G,) of the gains, by the linear model.
 
         more_load (N, W) [N] is the change of the latent loads less the part that the change of slip carries.
-        A step changes an angle by a factor within 0.6 and 1.6.
         """
         N, W = self.n, self.n_wheels
         change = more_load + at.load_residual - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
         if len(at.load_by_effects):
             change -= np.tensordot(gain_step[self.layout.effects], at.load_by_effects, 1)
-        low, high = angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)
-        return np.asarray(np.minimum(np.maximum(angle + change / at.load_slope, low), high))
+        return near_angle(angle, change / at.load_slope)
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) clipped to their ranges."""
@@ -482,19 +455,12 @@ class ObservationModel(Measurements):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(self.usable, depth, 0.0).sum(0) / known)
 
-    def standardised(self, at: Linearisation, gains: Array) -> tuple[Array, Array]:
-        """Each residual given the others of its instant, over its sd, and its derivatives in the same units.
+    def standardised(self, at: Linearisation) -> tuple[Array, Array]:
+        """Each residual given the others of its instant, over its sd (N, m), and derivatives (N, m, 6 + G) of these.
 
-        Returns
-        -------
-        residual : Array
-            (N, m), standard normal where model and noise are right; nan without a measurement.
-        derivatives : Array
-            (N, m, 6 + G).
+        Standard normal where model and noise are right; nan without a measurement.
         """
-        variance, row_var = self.variances(gains)
-        inverse = self.inverse_covariance(at.by_latents, variance, row_var)
-        root = np.sqrt(np.einsum("nmm->nm", inverse))
+        root = np.sqrt(np.einsum("nmm->nm", at.inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
         weighed[~self._known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
@@ -505,7 +471,7 @@ class ObservationModel(Measurements):
         layout, (n, m) = self.layout, at.by_latents.shape[:2]
         some = max(math.ceil(n / self.options.posterior.form_stride), 2)
         instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
-        sparse = self.part(instants)._contact_by_form(soil, gains, latents.part(instants))
+        sparse = self._contact_by_form(soil, gains, latents, instants)
         by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
@@ -519,14 +485,14 @@ class ObservationModel(Measurements):
         weighed = at.inverse @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
-    def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:
-        """Derivatives (3, 3, N, W) of drawbar pull, torque and sinkage by three form parameters, at the latent loads.
+    def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]) -> Array:
+        """Derivatives (3, 3, S, W) of drawbar pull, torque and sinkage by three form parameters, at some instants.
 
         The form parameters are the ratio of the angle of greatest stress to the entry angle, the
         ratio of the exit angle (positive behind the axle) to it, and the share of the other shear law.
         """
-        shape, other = (self.n, self.n_wheels), 1.0
-        state, model = self._wheels_in_contact(soil, gains, latents)
+        shape, other = (len(instants), self.n_wheels), 1.0
+        state, model = self._wheels_in_contact(soil, gains, latents, instants)
         if model.shear_law == "exponential":  # the same law as a share of 1, which can be reduced
             model, other = replace(model, shear_law="rational", exponential_share=1.0), -1.0
         _, d = wheel_forces_and_derivatives(state, model, ("peak", "leave", "exponential_share"))
@@ -536,20 +502,19 @@ class ObservationModel(Measurements):
         angle_by_form = -by_form[0] / by_angle[0]
         out = np.empty((3, 3, *shape))
         out[:2] = by_form[1:] + by_angle[1:, None] * angle_by_form
-        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle) * angle_by_form
+        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle[instants]) * angle_by_form
         return out
 
-    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
-        """States and model of the wheels at the latents."""
+    def _wheels_in_contact(
+        self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]
+    ) -> tuple[WheelState, WheelModel]:
+        """States and model of the wheels at some instants."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        return self._state(soil, latents.entry_angle, slip), self.model
+        return self._state(soil, latents.entry_angle[instants], slip[instants]), self.model
 
     def _state(self, soil: Soil, angle: Array, slip: Array) -> WheelState:
-        K_L = lumped_modulus(soil.k_c, soil.k_phi, self._width)
-        return WheelState(
-            angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K,
-            self._length,
-        )  # fmt: skip
+        radius, width, length = self._geometry[:, : angle.size]
+        return state_on(soil, angle.ravel(), slip.ravel(), radius, width, length)
 
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
         """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).
@@ -581,19 +546,28 @@ class ObservationModel(Measurements):
     def after(self, previous: Optimum) -> Latents:
         """Latents of this window at the optimum of an earlier one: of the instants of both as there, else as measured.
 
-        Parameters
-        ----------
-        previous : Optimum
-            End point of the fit of the earlier window.
+        Entry angles of these follow, to first order, from the earlier instant at which the wheel carried most nearly
+        the same.
         """
-        shared = self._shared(previous.t)
-        new = self.part(slice(shared, None)).start(Soil(*previous.soil.tolist()), gains=previous.gains)
-        return previous.latents.followed_by(shared, new) if shared else new
+        shared, old, at = self._shared(previous.t), previous.latents, previous.at
+        if not shared:
+            return self.start(Soil(*previous.soil.tolist()), gains=previous.gains)
+        load, speed, ground = self.load[shared:], self.speed[shared:], self.ground_speed[shared:]
+        near = np.abs(load[:, None] - old.load).argmin(axis=1), np.arange(self.n_wheels)
+        slip_change = (old.ground_speed[:, None] / old.speed)[near] - ground[:, None] / speed
+        more = load - old.load[near] + at.load_residual[near] - at.load_by_slip[near] * slip_change / self.rig.radius
+        angle = near_angle(old.entry_angle[near], more / at.load_slope[near])
+        return old.followed_by(shared, Latents(load, speed, ground, angle))
 
     def _shared(self, t: Array) -> int:
         """Number of first instants that are the last ones of times t (M,) [s]."""
         n = len(t) - int(np.searchsorted(t, self.t[0] - TIME_TOLERANCE))
         return n if 0 < n < self.n and np.abs(self.t[:n] - t[-n:]).max() < TIME_TOLERANCE else 0
+
+
+def near_angle(angle: Array, step: Array) -> Array:
+    """Entry angles [rad] after a step of the linear model, which changes them by a factor within 0.6 and 1.6."""
+    return np.asarray(np.clip(angle + step, angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)))
 
 
 def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Array:
@@ -608,21 +582,12 @@ SINGULAR_RIDGE = 1e-10
 
 
 def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array | None = None) -> Array:
-    """Inverse covariance (A V A' + R)^-1 (N, m, m) of the residuals of every instant.
+    """Inverse covariance (A V A' + R + further)^-1 (N, m, m) of the residuals of every instant.
 
-    Parameters
-    ----------
-    A : Array
-        Derivatives of the residuals by the observations (N, m, 2 W + 1).
-    variance, row_var : Array
-        Diagonals of V (N, 2 W + 1) and R (N, m): variances of observations and rows.
-    further : Array, optional
-        Covariance (N, m, m) besides.
-
-    Notes
-    -----
-    Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point far from any soil one
-    latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a point of finite cost.
+    A: derivatives of the residuals by the observations (N, m, 2 W + 1); variance (N, 2 W + 1) and row_var (N, m):
+    diagonals of V and R.  Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point
+    far from any soil one latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a
+    point of finite cost.
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
     diagonal = np.einsum("nmm->nm", S)  # a view

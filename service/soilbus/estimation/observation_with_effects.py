@@ -11,6 +11,7 @@ from copy import copy
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.linearisation import (
@@ -24,7 +25,6 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
 from soilbus.terra.effects.along import through_low_pass
 from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
-from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.tangent import forces_along
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import (
@@ -34,6 +34,7 @@ from soilbus.terra.wheel import (
     WheelModel,
     WheelState,
     sinkage,
+    state_on,
     wheel_forces,
 )
 
@@ -142,10 +143,7 @@ class ObservationModelWithEffects(ObservationModel):
     def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
         """The wheels at entry angles (N, W) [rad], with the radii and sinkages that the effects give them."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
-        state = WheelState(
-            angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K, self.rig.length
-        )
+        state = state_on(soil, angle, slip, self.rig.radius, self.rig.width, self.rig.length)
         surroundings = self._surroundings(latents)
         state, model = wheel_with(active, state, self.model, surroundings)
         return _Wheels(state, model, sinkage(angle, state.radius), surroundings)
@@ -230,17 +228,6 @@ class ObservationModelWithEffects(ObservationModel):
     def delay_terms(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
         """Corrections for measurements y late by d and by a low pass of tau: x(t) = (1 + tau d/dt) y(t + d).
 
-        Parameters
-        ----------
-        gains : Array
-            Sensor gains, then effect parameters (G,).
-        latents : Latents
-            Of all N instants.
-        torque : Array
-            Torques of the model (N, W) [N m].
-
-        Notes
-        -----
         y(t + d) = s(t + d) + c (y(t) - s(t)) with the smooth curve s of the measurements (see
         local_cubics): the noise of an instant stays with it, and c keeps its variance.  Else every
         delay would pair other noises or cancel a part, and some would seem to fit better.
@@ -263,8 +250,7 @@ class ObservationModelWithEffects(ObservationModel):
                     predicted, rate, by_tau = self._low_pass_terms(tau, latents, torque)
                     by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
                     tau, std, of_tau = 0.0, 0.0, 0.0
-                for column, series in enumerate(self._curves.of(quantity)):
-                    curve = series.smooth
+                for column, curve in enumerate(self._curves.of(quantity)):
                     _, slope, second = curve.at(self.t + d)
                     added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d, tau))
                     by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
@@ -300,9 +286,7 @@ class ObservationModelWithEffects(ObservationModel):
         and speeds by a polynomial in load and slip through the model's own torques.
         """
         off, slope, by_tau = (np.zeros(torque.shape) for _ in range(3))
-        loads, speeds, (ground,) = (
-            [series.smooth for series in self._curves.of(q)] for q in ("load", "speed", "ground_speed")
-        )
+        loads, speeds, (ground,) = (self._curves.of(q) for q in ("load", "speed", "ground_speed"))
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         for w, (load, speed) in enumerate(zip(loads, speeds, strict=True)):
             used = self.usable[:, w]
@@ -378,10 +362,13 @@ class ObservationModelWithEffects(ObservationModel):
         active = self.active(gains[self.layout.effects])
         return np.broadcast_to(self._wheels(soil, active, latents, latents.entry_angle).depth, latents.load.shape)
 
-    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
+    def _wheels_in_contact(
+        self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]
+    ) -> tuple[WheelState, WheelModel]:
         if not self.effects:
-            return super()._wheels_in_contact(soil, gains, latents)
-        wheels = self._wheels(soil, self.active(gains[self.layout.effects]), latents, latents.entry_angle)
+            return super()._wheels_in_contact(soil, gains, latents, instants)
+        some, active = latents.part(instants), self.active(gains[self.layout.effects])
+        wheels = self.part(instants)._wheels(soil, active, some, some.entry_angle)
         return wheels.state, wheels.model
 
 

@@ -32,13 +32,10 @@ class MeasurementOptions:
     load_tolerance: float = 0.02
     """Relative error of load [1] accepted in the first entry angles; each linearisation reduces it further."""
     max_side_load: float = 0.8
-    """Largest difference of an axle's loads left and right, over their sum [1]: no wheel leaves the ground.  With 0.56
-    five blind diagnoses behind differentials (seed 504) are the same."""
+    """Largest difference of an axle's loads left and right, over their sum [1]: no wheel leaves the ground."""
     load_time_scale: float = 0.1
     """Integral time scale T [s] of loads that shake, 2 T rms^2 / bin the variance of a bin's: a wheel that is lighter
-    for a moment slips more in it, so that errors of neighbouring bins add up.  With 0.02 s intervals are too narrow;
-    without any cell 95 % intervals of pressure hold in 96.9 +- 0.4 % (four seeds of `tests.lab.computed_loads`), with
-    0.125 s in 97.4."""
+    for a moment slips more in it, so that errors of neighbouring bins add up.  With 0.02 s intervals are too narrow."""
     unknown_slope: float = 0.4
     """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, so that slopes alone take the
     pull, and of an axle's loads left less right over their sum where no roll is measured: 3 degrees for seconds, of
@@ -51,8 +48,7 @@ class MeasurementOptions:
     tyre deflects by 30 to 50 mm under its load, so that 4 mm of wear, or a tenth less pressure, take a tenth of it."""
     largest_draft: float = 0.5
     """Largest draft that nothing measures, over the weight [1]: where net traction ratios of tractors in fields end
-    (Wismer & Luth 1974).  It shifts load to the rear in all of a window; counted as independent from bin to bin it left
-    tan phi on dry sand off by 1.8 sd on a rear-driven tractor without load cells."""
+    (Wismer & Luth 1974).  It shifts load to the rear in all of a window."""
     rolling_slip: float = -0.03
     """Slip [1] of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1
     of the load takes a skid of 2 to 5 % on field soils (Wong 2008, fig. 2.60)."""
@@ -60,8 +56,8 @@ class MeasurementOptions:
     """Largest skid (minus slip) [1] of a wheel without torque that is tried on the way to T = 0: ten times what field
     soils take, so that none of them is cut off."""
     slip_sd: float = 0.1
-    """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is measured.
-    With 0.07 and 0.13 a pressure moves by 0.9 and 0.1 sd at most."""
+    """Sd [1] of that slip, and of half the difference of two wheels' slips where only their motor's speed is
+    measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +65,16 @@ class SolverOptions:
     """Limits and tolerances of a descent."""
 
     max_evaluations: int = 40
-    """Of the model.  Joint descents of 42 windows from random soils take 9 in the mean, 1 in 100 more than 30."""
+    """Of the model.  Descents from random soils take 9 in the mean, 1 in 100 more than 30."""
     step_tolerance: float = 1e-6
     """Squared length of the next step in posterior sd, predicted from the ratio of the last two, from which a descent
-    has converged.  With 1e-5, 1 of 100 descents stopped in a curved valley, 0.2 of -2 log too high."""
+    has converged."""
     shortening: float = 0.4
-    """Factor [1] on the fraction of the step after a rejected step; 0.3 to 0.5 do the same."""
+    """Factor [1] on the fraction of the step after a rejected step."""
     max_rise: float = 1.0
     """Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Steps that
-    overshoot in a curved valley return by themselves: 0.2 to 1 do the same.  It is multiplied by `shortening` after
-    each rise, so that a descent does not overshoot for ever."""
+    overshoot in a curved valley return by themselves.  It is multiplied by `shortening` after each rise, so that a
+    descent does not overshoot for ever."""
     max_rejected: int = 6
     """Rejected steps in a row."""
     give_up_above: float = math.inf
@@ -92,10 +88,10 @@ class SearchOptions:
     same_end: float = 0.02
     """Relative difference of the objectives [1] below which two descents of the search have met."""
     thinned: int = 24
-    """Instants of a window that the search for starts uses.  With 12 and 48 no status of the golden replays moves."""
+    """Instants of a window that the search for starts uses."""
     plausible_chi2: float = 3.0
-    """Objective per residual [1] up to which an optimum of the search may be the soil's.  With 1.5 no status of the
-    golden replays moves, with 6 a window across a border gets an estimate."""
+    """Objective per residual [1] up to which an optimum of the search may be the soil's.  With 6 a window across a
+    border gets an estimate."""
     implausible: float = 60.0
     """Objective per thinned instant [-2 log] above which a window cannot be of one soil.  Without this limit the
     budget of a border's search is gone before another soil is found."""
@@ -103,25 +99,21 @@ class SearchOptions:
     """Evaluations from an end whose objective exceeds `implausible`: with 10 a window across the border of
     `replay-bogging` gets an estimate."""
     typical_depth: float = 0.03
-    """Sinkage [m] at which the bearing pressure is a coordinate.  With 0.015 and 0.06 no status of the golden replays
-    moves."""
+    """Sinkage [m] at which the bearing pressure is a coordinate."""
     max_log_step: float = 0.7
-    """Longest step of a coordinate [1, a logarithm]: a factor of two.  With 0.35 no status of the golden replays moves,
-    with 1.4 a window across a border gets an estimate."""
+    """Longest step of a coordinate [1, a logarithm]: a factor of two."""
     bound_sd: float = 4.0
-    """Bound of a free parameter's logarithm about the prior median [prior sd].  With 3 clay lies at a bound (306 states
-    of `replay-clay` are worse), with 6 no status moves."""
+    """Bound of a free parameter's logarithm about the prior median [prior sd].  With 3 clay lies at a bound."""
     max_angle_change: float = 0.1
-    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.  With 0.2
-    no status of the golden replays moves, but an sd of `diagnose-single-hardpan-graded-large` by 5 %: effects may be
-    curved where the soil alone is not."""
+    """Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated: effects
+    may be curved where the soil alone is not."""
     soil_alone: SolverOptions = SolverOptions(10, step_tolerance=0.1, max_rise=0.0)
     """Descent of the soil far from the optimum, with latents as measured: where it ends the joint descent goes on."""
     cold: SolverOptions = SolverOptions(step_tolerance=1e-2)
     """Joint descent of soil, gains and latents from there."""
     warm: SolverOptions = SolverOptions(step_tolerance=1e-2)
     """Joint descent from near the optimum, to 0.1 posterior sd: nearer, valleys of a drive that shakes end at no
-    optimum (85 of 170 windows of `b-2wd-loam` with 2e-4, 4 with 1e-2)."""
+    optimum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +125,11 @@ class PosteriorOptions:
     within `bound_sd` prior sd (of 0.83, std = value) is uniform, with 4^2 0.83^2 / 3 = 3.7.  At its bound a parameter
     that is linear in the fit may have any variance of its logarithm: without this k_phi had an std of 1e155 on snow."""
     form_discount: float = 3.0
-    """Residuals [1] that say as much of the contact's form as one would say without errors of the model that all share.
-    With 1 tan phi of `d-base-0` is 12 % off with an sd of 4 %, with 6 pressures on the foreign drives are 18 % off."""
+    """Residuals [1] that say as much of the contact's form as one would say without errors of the model that all
+    share."""
     form_stride: int = 4
     """One instant of this many gets derivatives by the form parameters, which are interpolated between them.  It is no
-    mere saving: with 1 the sd of tan phi differs by more than 15 % in 4 of 19 simulated windows, by a factor of 4 in
-    one on a curve."""
+    mere saving: by those of every instant the sd of tan phi differs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,31 +137,27 @@ class TrackerOptions:
     """When the soil has changed, and how one window's posterior is the next one's prior."""
 
     instant: float = 0.25
-    """Length of an instant [s], over which bins are averaged: tyres that relax over 0.3 m at 1.2 m/s take as long.
-    On rough ground tan phi is held by 31, 47 and 76 % of the windows of `d-inertia-0`, `e-overload-0` and
-    `b-plough-4wd` with bins of 0.1 or 0.04 s, by all of them with 0.25 to 0.5 s; from 0.33 s on e-hills' pressure is
-    held by 80 % in place of 92."""
+    """Length of an instant [s], over which bins are averaged: tyres that relax over 0.3 m at 1.2 m/s take as long."""
     false_alarms_per_hour: float = 1.0
     """Windows an hour [1/h] in which noise alone makes the change detector search for another soil."""
     steady_drift: float = 4.0
     """Prior sd of a steady change of the soil in one window, in units of `Settings.drift` [1]: a field that changes as
-    one goes, beside a random walk.  On soils that drift by 10 % a window 95 % of the intervals hold, with 0 only 88."""
+    one goes, beside a random walk."""
     several_soils: float = 6.0
     """Chi-square per residual [1], in units of what the windows before left, above which another soil is looked for.
-    Instants of two or three bins have less noise: with 3 ten windows of `replay-bogging` have no soil."""
+    Instants of two or three bins have less noise than single ones, for which 3 would do."""
     first_rounds: int = 4
     """Fits of a first window, each with the variance components that the one before left: the factors of `d-base-0`
     then change by less than a tenth."""
     significance: float = 25.0
     """Fall of -2 log evidence by two soils instead of one [1] from which a change is accepted: 5 sd of one unknown."""
     min_rows_per_soil: int = 12
-    """Residuals that each of two soils needs before they are compared.  With 10 a border in `replay-bogging` is taken
-    for a soil too early, with 90 two are found late."""
+    """Residuals that each of two soils needs before they are compared: with fewer a border passes for a soil, with many
+    more a soil is found late."""
     min_to_detect: float = 0.3
     """Windows [1] that a soil must fill before a change from it is looked for, that lie before the end of the last
     fit's data and are looked at again, and after a change point during which data that no soil explains may be of a
-    border.  With 0.5 borders are found alike, but seven of the sensor faults (`tests/daemon/test_input_faults.py`) are
-    called another soil, or late."""
+    border.  With 0.5 some faults of sensors are called another soil."""
     min_to_learn: float = 0.5
     """Windows [1] that the data must fill for the posterior to be a later prior: with less it is not Gaussian."""
     max_unexplained: float = 2.0

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,52 +94,16 @@ class Coordinates:
         self._last_directions[:] = soil, directions
         return directions
 
-    def curvature(self, gradient: Array) -> Array:
-        """Return the curvature (F, F) that the coordinates themselves add to the objective.
-
-        Parameters
-        ----------
-        gradient : (F,)
-            Half the gradient of what is linear in k_c.
-
-        Notes
-        -----
-        The model is nearly linear in k_c, and so curved in log k_c.  Only the positive part counts, which
-        shortens steps.
-        """
-        curvature = np.zeros((len(gradient), len(gradient)))
-        if _K_C in self._column:
-            i = self._column[_K_C]
-            curvature[i, i] = max(gradient[i], 0.0)
-        return curvature
-
     def stepped(self, soil: Array, step: Array) -> Array:
-        """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`.
-
-        c and tan phi change linearly: along c + p tan phi, which a window at one pressure p measures alone, a step in
-        logarithms would leave the valley.
-        """
+        """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`."""
         step = step * min(1.0, self.options.max_log_step / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
-        new = self.soil_at(self.position(soil) + step)
-        if _C in self._column:
-            new[_C] = soil[_C] * (1.0 + step[self._column[_C]])
-        if _PHI in self._column:
-            phi, tan = float(soil[_PHI]), math.tan(soil[_PHI])
-            change = phi * (1.0 + tan**2) * float(step[self._column[_PHI]])
-            new[_PHI] = math.atan(tan + change)
-        return self.within(new)
+        return self.soil_at(self.position(soil) + step)
 
     def step_fraction(self, soil: Array, step: Array) -> float:
         """Return the fraction of a step (F,) from a soil (6,) within the bounds and `max_log_step`, 1 at most."""
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
-        if _C in self._column:  # changes linearly, see `stepped`
-            room[self._column[_C]] = np.expm1(room[self._column[_C]])
-        if _PHI in self._column:
-            column, tan = self._column[_PHI], math.tan(soil[_PHI])
-            bound = math.tan(soil[_PHI] * math.exp(room[column]))
-            room[column] = (bound - tan) / (soil[_PHI] * (1.0 + tan**2))
         longest = self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
 
@@ -182,6 +146,12 @@ class Coordinates:
     def _column(self) -> dict[int, int]:
         """Index among the coordinates of each free parameter."""
         return {parameter: i for i, parameter in enumerate(self.free.tolist())}
+
+
+@lru_cache(maxsize=16)
+def coordinates_of(prior: SoilPrior, width: float, options: SearchOptions) -> Coordinates:
+    """Return the coordinates, the same ones for the same prior."""
+    return Coordinates(prior, width, options)
 
 
 def at_bounds(value: Array, low: Array, high: Array) -> Array:

@@ -45,7 +45,7 @@ NORMAL_95 = 1.959964
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class SoilPrior:
     """Log-normal prior: median (6,) in SI and sd of the logarithm (6,); sd 0 holds the parameter."""
 

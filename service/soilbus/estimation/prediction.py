@@ -26,16 +26,9 @@ class Share(NamedTuple):
 
 
 def prediction_shares(problem: ObservationModel, at: Linearisation, since: float, block: float) -> dict[str, Share]:
-    """Return the errors of the instants after `since`, by channel `torque` and `draft`.
+    """Return the errors of the instants after `since` [s], by channel `torque` and `draft`; block in s.
 
-    Parameters
-    ----------
-    problem, at
-        A window, and its linearisation at the estimate of earlier ones, with latents as measured.
-    since : float
-        Time [s] of the last instant that this estimate has seen.
-    block : float
-        Length of a block [s].
+    `at` is the window's linearisation at the estimate of earlier ones, with latents as measured.
     """
     new, (n, m) = problem.t > since, at.by_latents.shape[:2]
     if not new.any():

@@ -52,22 +52,12 @@ _K_C = PARAMETERS.index("k_c")
 
 @dataclass(frozen=True)
 class SoilClasses:
-    """Classes of soil in the coordinates of tyres of a mean width.
+    """Classes of soil in the coordinates of tyres of a mean width."""
 
-    Attributes
-    ----------
-    names
-        `unknown` is the last one.
-    centre, spread : (C, 6)
-        Mean and sd of each coordinate.
-    width
-        Mean tyre width [m].
-    """
-
-    names: tuple[str, ...]
-    centre: Array
+    names: tuple[str, ...]  # `unknown` is the last one
+    centre: Array  # (C, 6), mean and sd of each coordinate
     spread: Array
-    width: float
+    width: float  # mean tyre width [m]
 
     @classmethod
     def of_table(cls, width: float) -> SoilClasses:
@@ -80,19 +70,9 @@ class SoilClasses:
         return cls((*KINDS, UNKNOWN), np.vstack([known, known.mean(axis=0)]), spread, width)
 
     def probabilities(self, posterior: Posterior, guess: SoilPrior) -> dict[str, float]:
-        """Return the probability of each class given a window's posterior.
+        """Return the probability of each class given a window's posterior, the largest first.
 
-        Parameters
-        ----------
-        posterior
-            Of the soil.
-        guess
-            The part of its prior that was only a guess (see `guessed`); it is not evidence and is divided out.
-
-        Returns
-        -------
-        dict
-            Probability by name, the largest first.
+        guess is the part of its prior that was only a guess (`guessed`): it is not evidence and is divided out.
         """
         measured = _evidence(posterior, guess, self.width, self.spread[-1])
         centre, spread = self.centre[:, measured.parameters], self.spread[:, measured.parameters]
@@ -159,17 +139,8 @@ def _evidence(posterior: Posterior, guess: SoilPrior, width: float, scale: Array
 
 
 def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> list[Soil]:
-    """Return the soils of the table by their likelihood, the best first.
+    """Return the soils by their likelihood, the best first, by six instants with loads and slips as measured.
 
-    Parameters
-    ----------
-    problem
-        A window; six instants of it are used, with loads and slips as measured.
-    soils
-        In SI.
-
-    Notes
-    -----
     The misfit is the sum of squares of predicted less measured torque, pull and sinkage over
     a tenth of their size: a field is not the table's.
     """

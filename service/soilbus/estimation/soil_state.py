@@ -64,25 +64,13 @@ class ChangePoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SoilState:
-    """State of the tracker: which soil the windows are of.
+    """State of the tracker: which soil the windows are of."""
 
-    Attributes
-    ----------
-    name, reason
-        The state, and why it is so.
-    transition
-        The last one: data before its end are of another soil.
-    change
-        A change point that no other soil explains yet.
-    mismatch
-        Whether the last fit was a mismatch.
-    """
-
-    name: TrackerState = TrackerState.STEADY
+    name: TrackerState = TrackerState.STEADY  # the state, and why it is so
     reason: Reason = Reason.ONE_SOIL
-    transition: Transition | None = None
-    change: ChangePoint | None = None
-    mismatch: bool = False
+    transition: Transition | None = None  # the last one: data before its end are of another soil
+    change: ChangePoint | None = None  # a change point that no other soil explains yet
+    mismatch: bool = False  # whether the last fit was a mismatch
 
     def spans_border(self, start: float) -> bool:
         """Return whether a window from `start` [s] on may still have data of another soil."""
@@ -91,44 +79,18 @@ class SoilState:
 
 
 class Shown(NamedTuple):
-    """What a window tells of a change of soil.
+    """What a window tells of a change of soil."""
 
-    Attributes
-    ----------
-    found
-        Why data before the end of `transition` are of another soil than those after it, or before `change` than those
-        after it; None where they are of the soil of the window before.
-    transition
-        The last transition, found now or before.
-    change
-        The change point, where there is one.
-    mismatch, settled
-        Whether the fit exceeds its limit of chi-square; whether it keeps that just after a border.
-    """
-
+    # why data before the end of `transition` are of another soil than those after it, or before `change` than those
+    # after it; None where they are of the soil of the window before
     found: Reason | None
-    transition: Transition | None
-    change: ChangePoint | None
-    mismatch: bool
-    settled: bool
+    transition: Transition | None  # the last transition, found now or before
+    change: ChangePoint | None  # the change point, where there is one
+    mismatch: bool  # whether the fit exceeds its limit of chi-square
 
 
 def next_state(state: SoilState, shown: Shown, end: float, window: float) -> SoilState:
-    """Return the state after a window that ended at `end` [s], of length `window` [s].
-
-    Parameters
-    ----------
-    state : SoilState
-        After the window before.
-    shown : Shown
-        What the window shows.
-    end, window : float
-        [s].
-
-    Returns
-    -------
-    SoilState
-    """
+    """Return the state after a window of length `window` that ended at `end` [s]."""
     S, transition, now = TrackerState, shown.transition, replace(state, change=shown.change, mismatch=shown.mismatch)
     if shown.found in (Reason.CHANGE_STATISTIC, Reason.MISMATCH):
         return replace(now, name=S.SUSPECT, reason=shown.found)
@@ -136,6 +98,6 @@ def next_state(state: SoilState, shown: Shown, end: float, window: float) -> Soi
         one = Reason.ONE_SOIL if shown.change is None else Reason.UNCONFIRMED
         return replace(now, name=S.STEADY, reason=Reason.MISMATCH if shown.mismatch else one)
     now = replace(now, transition=transition)
-    if not shown.settled:
+    if shown.mismatch:
         return replace(now, name=S.TRANSITION, reason=Reason.UNSETTLED)
     return replace(now, name=S.NEW_SOIL, reason=shown.found or Reason.SPANS_BORDER)

@@ -6,10 +6,8 @@ covariance, p the residuals of the prior and P its precision,
     objective     F(theta) = -2 log posterior = r' W r + p' P p + constant
     Jacobian      J = dr/dtheta,   J_p = dp/dtheta
     model         gradient g = J' W r + J_p' P p,   information H = J' W J + J_p' P J_p
-    step          (H + C) d = -g,   subject to the active bounds
+    step          H d = -g,   subject to the active bounds
     decrease      of F, predicted for a full step: D = d' H d, its squared length in posterior sd
-
-C is the positive part of the curvature that the coordinates add (parametrization.Coordinates.curvature).
 
 `Objective` evaluates residuals, Jacobian and prior at an `Iterate` and returns the `QuadraticModel` there.  `minimise`
 is the loop: step, evaluate, accept or reject.  `SolverOptions` holds its numbers, `Termination` says why it ended.
@@ -29,11 +27,11 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
+from soilbus.estimation.gaussian import Gaussian, PriorQuadratic, solve_with_inverse
 from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
-from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
+from soilbus.estimation.parametrization import at_bounds, coordinates_of, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
 
@@ -60,30 +58,13 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticModel:
-    """An objective's quadratic model at an iterate, by F free coordinates and A active gains.
+    """An objective's quadratic model at an iterate, by F free coordinates and A active gains."""
 
-    Attributes
-    ----------
-    information : (F + A, F + A)
-        Gauss-Newton Hessian, half that of -2 log posterior: data and prior.
-    prior_information : (F + A, F + A)
-        The prior's part of it.
-    curvature : (F + A, F + A)
-        What the coordinates' own curvature adds for a step.
-    gradient : (F + A,)
-        Half the gradient of -2 log posterior.
-    neg2_log_posterior : float
-        Value of the objective, up to a constant.
-    active_bounds : (E, F + A)
-        Outward directions of the bounds that the iterate is at: no step goes there.
-    """
-
-    information: Array
-    prior_information: Array
-    curvature: Array
-    gradient: Array
-    neg2_log_posterior: float
-    active_bounds: Array
+    information: Array  # (F + A, F + A), Gauss-Newton Hessian, half that of -2 log posterior: data and prior
+    prior_information: Array  # (F + A, F + A), the prior's part of it
+    gradient: Array  # (F + A,), half the gradient of -2 log posterior
+    neg2_log_posterior: float  # value of the objective, up to a constant
+    active_bounds: Array  # (E, F + A), outward directions of the bounds that the iterate is at: no step goes there
 
     def step(self) -> Array | None:
         """Return the step (F + A,) to the model's minimum within the active bounds; None where there is no minimum.
@@ -91,7 +72,7 @@ class QuadraticModel:
         A step that would cross an active bound goes along it, to the least value there.
         """
         right = np.concatenate([self.gradient[None], self.active_bounds]).T
-        solution = _solution(self.information + self.curvature, right)
+        solution = _solution(self.information, right)
         if solution is None:
             return None
         step = -solution[:, 0]
@@ -121,36 +102,6 @@ class WindowModel(QuadraticModel):
     """The quadratic model of a window, with the linearisation of its data: residuals and Jacobian."""
 
     linearisation: Linearisation
-
-
-class GaussianApproximation(NamedTuple):
-    """A window's linear model at its optimum, with the prior.
-
-    Attributes
-    ----------
-    directions : (1 + 6 + G, F + A)
-        As `Objective.directions`.
-    prior
-        The prior's quadratic there.
-    step : (F + A,)
-        H^-1 g, to be subtracted: leads to the minimum.
-    covariance : (F + A, F + A)
-        H^-1.
-    """
-
-    directions: Array
-    prior: PriorQuadratic
-    step: Array
-    covariance: Array
-
-    def explained(self, mixed: Array) -> tuple[Array, Array]:
-        """Return what soil and gains explain of gradient (K,) and information (K, K) of other unknowns."""
-        return mixed @ self.step, mixed @ self.covariance @ mixed.T
-
-
-def coordinates_of(problem: ObservationModel, prior: SoilPrior) -> Coordinates:
-    """Return the coordinates of a window's free parameters."""
-    return Coordinates(prior, float(problem.rig.width.mean()), problem.options.search)
 
 
 class Objective:
@@ -183,7 +134,7 @@ class Objective:
         as_measured: bool = False,
     ) -> None:
         self.problem, self.joint_prior, self.options = problem, joint_prior, problem.options.search
-        self.coordinates = coordinates_of(problem, prior)
+        self.coordinates = coordinates_of(prior, problem.rig.mean_width, self.options)
         self.as_measured = as_measured
         is_active = np.diag(joint_prior.covariance)[_SOIL:] > 0.0
         is_active[: problem.n_sensors if as_measured else 0] = False
@@ -194,9 +145,12 @@ class Objective:
         self._identity = np.eye(len(self.free) + len(self.active))
         self._gain_directions = np.zeros((FIRST_GAIN + len(joint_prior.gains), len(self._identity)))
         self._gain_directions[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
-        self.prior_factor = PriorFactor(joint_prior, prior, self.active, self.coordinates.width)
-        self._prior_cache: tuple[Array, Array, PriorQuadratic] | None = None
-        self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
+        self.unknowns = np.concatenate([self.free, _SOIL + self.active])
+        of_unknowns = joint_prior.covariance[self.unknowns[:, None], self.unknowns]
+        solution = solve_with_inverse(of_unknowns, np.zeros(len(of_unknowns)))
+        if solution is None:
+            raise ValueError("the prior has no proper covariance")
+        self.prior_precision = solution[1]
 
     def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
         """Return the same window under another joint prior."""
@@ -287,7 +241,6 @@ class Objective:
 
     def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> WindowModel | None:
         """Return the quadratic model from the data's linearisation at an iterate; None where it is not finite."""
-        free = len(self.free)
         directions = self.directions(iterate)
         if self.as_measured:
             directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
@@ -296,12 +249,9 @@ class Objective:
         neg2_log_posterior = linearisation.chi2 + prior.neg2_log_prior
         if not math.isfinite(neg2_log_posterior):
             return None
-        curvature = np.zeros_like(self._identity)
-        curvature[:free, :free] = self.coordinates.curvature((gradient + prior.gradient_of_data)[:free])
         return WindowModel(
             information=directions.T @ linearisation.normal @ directions + prior.information,
             prior_information=prior.information,
-            curvature=curvature,
             gradient=gradient + prior.gradient,
             neg2_log_posterior=neg2_log_posterior,
             active_bounds=self._active_bounds(iterate),
@@ -309,14 +259,15 @@ class Objective:
         )
 
     def prior_at(self, iterate: Iterate) -> PriorQuadratic:
-        """Return the prior's quadratic at an iterate, and keep it for the next call with the same one."""
-        last = self._prior_cache
-        if last is None or last[0] is not iterate.soil or last[1] is not iterate.gains:
-            by_logs = self._identity.copy()
-            by_logs[: len(self.free), : len(self.free)] = self.coordinates.log_directions(iterate.soil)[self.free]
-            prior = self.prior_factor.quadratic_at(iterate.soil, iterate.gains, by_logs)
-            last = self._prior_cache = iterate.soil, iterate.gains, prior
-        return last[2]
+        """Return the prior's quadratic at an iterate."""
+        by_unknowns, off = self.prior_jacobian(iterate.soil), self.prior_residuals(iterate.soil, iterate.gains)
+        weighted = by_unknowns.T @ self.prior_precision
+        return PriorQuadratic(weighted @ by_unknowns, weighted @ off, float(off @ self.prior_precision @ off))
+
+    def prior_residuals(self, soil: Array, gains: Array) -> Array:
+        """Return log soil and gains less the prior's mean (F + A,), of what is free and active."""
+        logs = np.log(soil[self.free] / self.joint_prior.soil[self.free])
+        return np.concatenate([logs, (gains - self.joint_prior.gains)[self.active]])
 
     def directions(self, iterate: Iterate) -> Array:
         """Return the derivatives (1 + 6 + G, F + A) of (1, soil, gains) by free coordinates and active gains.
@@ -333,36 +284,14 @@ class Objective:
         jacobian[:_SOIL, : len(self.free)] = self.coordinates.log_directions(soil)
         return jacobian
 
-    def prior_jacobian(self, optimum: Optimum) -> Array:
-        """Return the derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
-        unknowns = np.concatenate([self.free, _SOIL + self.active])
-        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum.soil)[unknowns])
+    def prior_jacobian(self, soil: Array) -> Array:
+        """Return the derivatives (F + A, F + A) of the prior's residuals by coordinates and active gains."""
+        return np.asarray(self.parameter_jacobian(soil)[self.unknowns])
 
-    # Gaussians at an optimum
-
-    def approximation_at(self, optimum: Optimum) -> GaussianApproximation | None:
-        """Return the linear model at an optimum; None where its information is singular."""
-        if self._approximation is None or self._approximation[0] is not optimum:
-            iterate = Iterate.of(optimum)
-            directions, prior = self.directions(iterate), self.prior_at(iterate)
-            by_unknowns = directions.T @ optimum.at.normal
-            solution = solve_with_inverse(
-                by_unknowns @ directions + prior.information, by_unknowns[:, 0] + prior.gradient
-            )
-            self._approximation = (
-                optimum,
-                None if solution is None else GaussianApproximation(directions, prior, *solution),
-            )
-        return self._approximation[1]
-
-    def gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
-        """Return the Gaussian with this covariance of coordinates and active gains, linearised at `base`."""
-        jacobian = self.parameter_jacobian(soil if base is None else base)
-        logs = jacobian @ covariance @ jacobian.T
-        if base is None:
-            return Gaussian(soil, gains, logs)
-        of_base, prior = Gaussian(base, gains, logs), self.coordinates.prior
-        return of_base.relinearised(soil, gains, prior, self.coordinates.width)
+    def gaussian(self, soil: Array, gains: Array, covariance: Array) -> Gaussian:
+        """Return the Gaussian with this covariance of coordinates and active gains."""
+        jacobian = self.parameter_jacobian(soil)
+        return Gaussian(soil, gains, jacobian @ covariance @ jacobian.T)
 
 
 class Termination(StrEnum):
@@ -400,30 +329,20 @@ class Minimisable(Protocol[PointT, ModelT]):
 
 
 class Solution(NamedTuple, Generic[PointT, ModelT]):
-    """The end of a descent.
+    """The end of a descent."""
 
-    Attributes
-    ----------
-    iterate
-        One full step after `previous`.
-    previous
-        The iterate at which `model` was evaluated: the last one where the descent converged, else that of least value.
-    model
-        The quadratic model there; None where it is not finite.
-    predicted_decrease
-        Of the objective by the full step.
-    evaluations
-        Of the model.
-    termination
-        Why it ended.
-    """
-
-    iterate: PointT
+    iterate: PointT  # one full step after `previous`
+    # the iterate at which `model` was evaluated: the last one where the descent converged, else that of least value
     previous: PointT
-    model: ModelT | None
-    predicted_decrease: float
-    evaluations: int
-    termination: Termination
+    model: ModelT | None  # the quadratic model there; None where it is not finite
+    predicted_decrease: float  # of the objective by the full step
+    evaluations: int  # of the model
+    termination: Termination  # why it ended
+
+    @property
+    def value(self) -> float:
+        """Value of the objective at `previous`; nan without a model."""
+        return math.nan if self.model is None else self.model.neg2_log_posterior
 
 
 class _Expansion(NamedTuple, Generic[PointT, ModelT]):
@@ -441,21 +360,8 @@ def minimise(
 ) -> Solution[PointT, ModelT]:
     """Descend from a start.
 
-    Parameters
-    ----------
-    objective
-        Of a window, or of recordings.
-    start
-        Where to begin.
-    options
-        Numbers of the descent.
-    last_decrease
-        Predicted decrease of the full step that led to the start; 0 where it is unknown.  None: the descent does not
-        end at the start, where the latents are as measured and the objective is underestimated.
-
-    Returns
-    -------
-    Solution
+    last_decrease is the predicted decrease of the full step that led to the start, 0 where it is unknown.  None: the
+    descent does not end at the start, where the latents are as measured and the objective is underestimated.
     """
     here = lowest = _expanded(objective, start)
     if here is None or lowest is None:

@@ -5,8 +5,7 @@
         soil   covariance += drift^2 elapsed D D'     (random walk of the coordinates, D their log directions)
         gains  variance   += gain_std^2 min((elapsed + 1) / 60, 1)
 
-    so that no sample counts twice.  Of k_c, n, phi and c the likelihood factor is carried, apart from their priors,
-    since likelihoods add up in k_c, n, tan phi and c and not in their logarithms (`Gaussian.likelihood_factor`).
+    so that no sample counts twice.
 
 A window is fitted as one soil, from the optimum of the last one (warm start).  Where the newest data disagree with
 that soil (change_detection) or it does not describe the window, another soil is searched for (`Tracker._explained`),
@@ -36,7 +35,7 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.options import ESTIMATOR
-from soilbus.estimation.parametrization import Coordinates
+from soilbus.estimation.parametrization import coordinates_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.prediction import Share, prediction_shares
 from soilbus.estimation.search_budget import SearchBudget
@@ -61,80 +60,39 @@ _SOIL = len(PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Configuration of the tracker.
+    """Configuration of the tracker."""
 
-    Attributes
-    ----------
-    window : float
-        Length of a window [s].
-    min_speed : float
-        Ground speed [m/s] up to which instants are left out.
-    max_turn : float
-        Relative difference of an axle's rim speeds above which instants are left out.
-    drift : float
-        Sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time.
-    min_rows : int
-        Residuals below which a window is not fitted.
-    form : tuple of float
-        How far each of `model_form.FORM` may be from the configured model; () holds the form.
-    search_rate, search_burst : float
-        Evaluations of the model that searches may take, see `SearchBudget`.
-    hop : float
-        Time [s] from one window to the next.
-    instant : float
-        Length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins.
-    stated_noise : bool
-        Whether a first fit that leaves more than the stated noise is a mismatch: of rows without shaking or lateness.
-    """
-
-    window: float
-    min_speed: float
-    max_turn: float
+    window: float  # length of a window [s]
+    min_speed: float  # ground speed [m/s] up to which instants are left out
+    max_turn: float  # relative difference of an axle's rim speeds above which instants are left out
+    # sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time
     drift: float
-    min_rows: int = 15
+    min_rows: int = 15  # residuals below which a window is not fitted
+    # how far each of `model_form.FORM` may be from the configured model; () holds the form
     form: tuple[float, ...] = ()
-    search_rate: float = 4.0
+    search_rate: float = 4.0  # evaluations of the model that searches may take, see `SearchBudget`
     search_burst: float = 100.0
-    hop: float = 1.0
+    hop: float = 1.0  # time [s] from one window to the next
+    # length [s] of the instants that bins are averaged to (`instants`); 0 keeps the bins
     instant: float = ESTIMATOR.tracker.instant
+    # whether a first fit that leaves more than the stated noise is a mismatch: of rows without shaking or lateness
     stated_noise: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerOutput:
-    """Result of one window.
+    """Result of one window."""
 
-    Attributes
-    ----------
-    fit : Fit or None
-        None without enough residuals or where no fit ended.
-    mismatch : bool
-        Whether the model fails to describe the data.
-    state : TrackerState
-        Which soil the estimate is of.
-    since : float
-        Time [s] where the data that count begin.
-    standstill, turning : int
-        Instants left out.
-    search_ended : bool
-        Whether the budget of evaluations ended the search for a soil that describes the data.
-    reason : Reason
-        Why the state is so.
-    change : ChangePoint or None
-        The present change point.
-    prediction : Mapping of str to Share
-        By channel, how far the newest data are from what the windows before predict.
-    """
-
-    fit: Fit | None
-    mismatch: bool
-    state: TrackerState
-    since: float
-    standstill: int = 0
+    fit: Fit | None  # None without enough residuals or where no fit ended
+    mismatch: bool  # whether the model fails to describe the data
+    state: TrackerState  # which soil the estimate is of
+    since: float  # time [s] where the data that count begin
+    standstill: int = 0  # instants left out
     turning: int = 0
-    search_ended: bool = False
-    reason: Reason = Reason.ONE_SOIL
-    change: ChangePoint | None = None
+    search_ended: bool = False  # whether the budget of evaluations ended the search for a soil that describes the data
+    reason: Reason = Reason.ONE_SOIL  # why the state is so
+    change: ChangePoint | None = None  # the present change point
+    # by channel, how far the newest data are from what the windows before predict
     prediction: Mapping[str, Share] = field(default_factory=dict)
 
 
@@ -250,19 +208,7 @@ class Tracker:
         return self._components
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
-        """Estimate one window; windows come in their order.
-
-        Parameters
-        ----------
-        window : Window
-            Bin means and variances.
-        end : float
-            Time [s] of the window's end.
-
-        Returns
-        -------
-        TrackerOutput
-        """
+        """Estimate one window of bin means that ends at `end` [s]; windows come in their order."""
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
         if not recent:  # what windows before left is no measure of ground that none of them was on
@@ -283,8 +229,7 @@ class Tracker:
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)
         fit = explanation.fit
-        settled = not self.mismatch(fit)
-        shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit), settled)
+        shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit))
         state = next_state(self._state, shown, end, self.settings.window)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
@@ -515,7 +460,8 @@ class Tracker:
 
     def _drift(self, gaussian: Gaussian, elapsed: float) -> Array:
         """Covariance (6, 6) of the drift of the soil's logarithms in `elapsed` windows."""
-        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(gaussian.soil)
+        coordinates = coordinates_of(self.soil_prior, self.rig.mean_width, self.rig.options.search)
+        directions = coordinates.log_directions(gaussian.soil)
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
     def _ended(self, t: float) -> list[int]:
@@ -531,9 +477,8 @@ class Tracker:
         if fit is None or not fit.converged:
             return fit
         form = self._form_posterior(objective, fit)
-        half = self.options.steady_drift * self.settings.drift / 2.0  # from a window's middle to its end
-        directions = Coordinates(self.soil_prior, float(self.rig.width.mean())).log_directions(fit.mode.soil)
-        mode = fit.mode.drifted(half**2 * (directions @ directions.T), np.zeros(len(fit.gains)))
+        half = (self.options.steady_drift / 2.0) ** 2  # from a window's middle to its end
+        mode = fit.mode.drifted(self._drift(fit.mode, half), np.zeros(len(fit.gains)))
         return replace(fit, mode=mode, form=form)
 
     def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:
@@ -558,7 +503,7 @@ class Tracker:
         self._components = self._components.after(ratios)
         learned = end - tracked.since >= self.options.min_to_learn * self.settings.window
         if learned and state.name in (TrackerState.STEADY, TrackerState.NEW_SOIL):
-            self._posteriors.append((end, replace(fit.mode.likelihood_factor(self.soil_prior), form=fit.form)))
+            self._posteriors.append((end, replace(fit.mode, form=fit.form)))
             self._newest_posterior = fit.mode
 
 

@@ -36,19 +36,11 @@ KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class VarianceComponents:
-    """Factors on the sensors' variances by kind, learned from `weight` windows.
-
-    Attributes
-    ----------
-    factor : Mapping of str to float
-        Of the kinds seen so far; 1 of every other.
-    weight : float
-        Windows that the factors rest on.
-    """
+    """Factors on the sensors' variances by kind, learned from `weight` windows."""
 
     options: VarianceOptions
-    factor: Mapping[str, float] = field(default_factory=dict)
-    weight: float = 0.0
+    factor: Mapping[str, float] = field(default_factory=dict)  # of the kinds seen so far; 1 of every other
+    weight: float = 0.0  # windows that the factors rest on
 
     def scaled(self, window: Window, rig: Rig) -> Window:
         """Return the window with the variances of sensors, and of loads that none measures, times their factors."""
@@ -81,17 +73,7 @@ class VarianceComponents:
 
 
 def correction_ratios(problem: ObservationModel, optimum: Optimum, options: VarianceOptions) -> dict[str, float]:
-    """Return the factor of each kind of sensor by which its corrections exceed what its variance says.
-
-    Parameters
-    ----------
-    problem : ObservationModel
-        The fitted window.
-    optimum : Optimum
-        Its fit.
-    options : VarianceOptions
-        Length of a block.
-    """
+    """Return the factor of each kind of sensor by which its corrections exceed what its variance says."""
     values, expected, of_kind = corrections(problem, optimum.at, optimum.gains)
     squares = np.stack([(v**2).sum(axis=0) for v in (values, block_sums(values, problem.t, options.block))])
     shown = expected.sum(axis=0)

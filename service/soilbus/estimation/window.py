@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.local_cubics import Series
+from soilbus.estimation.local_cubics import Curve
 from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.terra.vehicle import Chassis, pull_required
 
@@ -105,6 +105,11 @@ class Rig:
     """Tuning values of its estimator."""
 
     @property
+    def mean_width(self) -> float:
+        """Mean width [m] of the tyres."""
+        return float(self.width.mean())
+
+    @property
     def length(self) -> Array | float:
         """Contact lengths [m] (W,); the number 0 where all are wheels."""
         return 0.0 if self.lengths is None else self.lengths
@@ -156,7 +161,7 @@ class Window:
     variance: Mapping[str, Array]
     samples: int
     yaw_rate: Array = field(default_factory=lambda: np.empty(0))
-    curves: Mapping[str, Series] = field(default_factory=dict)
+    curves: Mapping[str, Curve] = field(default_factory=dict)
     roll: Array = field(default_factory=lambda: np.empty(0))
     steering_angle: Array = field(default_factory=lambda: np.empty(0))
     differential_lock: Array = field(default_factory=lambda: np.empty(0))
@@ -356,14 +361,7 @@ class NoiseTable(NamedTuple):
     def sd(self, count: NDArray[np.intp], size: Array, level: Array) -> Array:
         """Return the sd (N,) of samples with magnitudes `size` (N,), sorted by channel.
 
-        Parameters
-        ----------
-        count : Array
-            Number of samples of each of the first C channels.
-        size : Array
-            Magnitudes of the samples (N,).
-        level : Array
-            Mean magnitude of each of these channels (C,).
+        count, level: number of samples, and mean magnitude, of each of the first C channels.
         """
         least = self.least[: len(count)]
         fixed = self.variance[: len(count)] + (self.of_mean[: len(count)] * np.maximum(level, least)) ** 2
@@ -375,20 +373,9 @@ class NoiseTable(NamedTuple):
 
 
 def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, samples: int) -> Window:
-    """Return a window from bin means.
+    """Return a window from bin means (N, channels), in the order of `Rig.channels`, at times t (N,) [s].
 
-    Parameters
-    ----------
-    noise : NoiseTable
-        Of the rig.
-    t : Array
-        Times of the bins [s] (N,).
-    mean : Array
-        Bin means (N, channels), in the order of `Rig.channels`.
-    worth : Array
-        Effective number of independent samples in each bin (N, channels); 0 where it has no value.
-    samples : int
-        Number of samples in all bins.
+    worth (N, channels): effective number of independent samples in each bin; 0 where it has no value.
     """
     variance = _variance_of_means(mean, worth, noise)
     values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)

@@ -44,7 +44,7 @@ from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
 from soilbus.pipeline.determination import draft_is_known, excitation_of, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask, input_rejected
-from soilbus.pipeline.model_gap import GapWatch, PredictionWatch, squares
+from soilbus.pipeline.model_gap import SPAN, PredictionWatch, Sums, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.effects.steady import CompletedModel
@@ -106,7 +106,7 @@ class WindowEstimator:
         self._effects_and_parameters = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
-        self._gap, self._predictions = GapWatch(), PredictionWatch(config.estimator.window)
+        self._gap, self._predictions = Sums(SPAN), PredictionWatch(config.estimator.window)
         shared = [f"load.{wheels[0].name}" for wheels in config.same_signal("load") if len(wheels) > 1]
         self._mismatch = " ".join(["model_mismatch", *shared])
         self._held = Held()
@@ -202,7 +202,7 @@ class WindowEstimator:
             prediction_error=self._predictions.shares(),
             standing=self._standing(fit),
             noise_factors={kind: math.sqrt(f) for kind, f in self._tracker.components.factor.items()},
-            channel_chi2=self._gap.chi2(),
+            channel_chi2=self._gap.ratios(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
             z_driven=None if fit is None or posterior is None else sinkage_range(fit, self._driven_rig),
@@ -281,7 +281,7 @@ class WindowEstimator:
     def _watch_model(self, task: WindowTask, tracked: TrackerOutput) -> None:
         """Take a window's squares and predictions; those with missing or poor inputs do not count."""
         if task.fresh:
-            self._gap, self._predictions = GapWatch(), PredictionWatch(self._settings.window)
+            self._gap, self._predictions = Sums(SPAN), PredictionWatch(self._settings.window)
         if tracked.fit is not None and not task.missing and not task.poor:
             self._gap.take(task.end, squares(tracked.fit.optimum.at, len(self.rig.wheels)))
             self._predictions.take(task.end, tracked.prediction)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +51,7 @@ def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
     return {name: of for name, of in found.items() if of.rows and math.isfinite(of.total)}
 
 
-class _Sums:
+class Sums:
     """Sums by channel of what was taken in the last `span` seconds."""
 
     def __init__(self, span: float) -> None:
@@ -84,29 +85,14 @@ class _Sums:
             for channel, (one, other) in found.items():
                 if other > 0.0:
                     ratios.setdefault(channel, []).append(one / other)
-        return {channel: float(np.sqrt(np.median(values))) for channel, values in ratios.items()}
-
-
-class GapWatch:
-    """Chi-square of each channel over the last SPAN."""
-
-    def __init__(self) -> None:
-        self._sums = _Sums(SPAN)
-
-    def take(self, end: float, found: Mapping[str, Square]) -> None:
-        """Add one window that ended at `end` [s]."""
-        self._sums.take(end, found)
-
-    def chi2(self) -> dict[str, float]:
-        """Return the reduced chi-square of every channel."""
-        return self._sums.ratios()
+        return {channel: math.sqrt(median(values)) for channel, values in ratios.items()}
 
 
 class PredictionWatch:
     """Errors of predictions over the last window [s], and over minutes."""
 
     def __init__(self, window: float) -> None:
-        self._window, self._minutes = _Sums(window), _Sums(SPAN)
+        self._window, self._minutes = Sums(window), Sums(SPAN)
 
     def take(self, end: float, found: Mapping[str, Share]) -> None:
         """Add the newest data of a window that ended at `end` [s]."""
@@ -115,7 +101,7 @@ class PredictionWatch:
 
     def shares(self) -> dict[str, float]:
         """Return the error of each channel over its size, of the last window."""
-        return {channel: float(np.sqrt(ratio)) for channel, ratio in self._window.ratios().items()}
+        return {channel: math.sqrt(ratio) for channel, ratio in self._window.ratios().items()}
 
     def error(self) -> float:
         """Return the largest of the channels' usual shares; 0 before anything was predicted.
@@ -128,5 +114,5 @@ class PredictionWatch:
         """Return the channels whose share has been above the limit for minutes, the worst first."""
         if self._minutes.length < LEAST_SPAN:
             return {}
-        found = {channel: float(np.sqrt(ratio)) for channel, ratio in self._minutes.ratios().items()}
+        found = {channel: math.sqrt(ratio) for channel, ratio in self._minutes.ratios().items()}
         return {c: share for c, share in sorted(found.items(), key=lambda item: -item[1]) if share > limit}

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.local_cubics import PHASE_PARTS, Curve, Series, curve_of, faithful, variance_of_one
+from soilbus.estimation.local_cubics import PHASE_PARTS, Curve, curve_of, variance_of_one
 from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
@@ -41,10 +41,6 @@ class _Channel(NamedTuple):
     value: Array
     curve: Curve
     needed: bool
-
-    def series(self) -> Series:
-        """The smoothing curve, and one through half as many samples (less bias)."""
-        return Series(self.curve, faithful(self.curve, self.value))
 
 
 class _Binned(NamedTuple):
@@ -77,7 +73,7 @@ def resolved_window(store: Bins, end: float) -> Window:
     channels = list(_channels(samples, store, noise))
     span = end - store.origin
     names = store.rig.channels
-    curves = {names[c.column]: c.series().later(store.origin) for c in channels}
+    curves = {names[c.column]: c.curve._replace(t=c.t + store.origin) for c in channels}
     length = _bin_length(channels, store.bin_length, span, store.options.max_loss)
     if length >= store.bin_length:
         return replace(whole, curves=curves)
