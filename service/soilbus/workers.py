@@ -70,21 +70,27 @@ class _SpawnContext(SpawnContext):
 def workers(
     count: int, method: Literal["fork", "spawn"], begin: Callable[..., None], *arguments: Any
 ) -> Iterator[ProcessPoolExecutor]:
-    """Give a pool of `count` processes, each of which calls `begin` first.
-
-    They are killed when this process dies, and when the thread that starts them ends.  Left by an exception, the
-    context waits for none of them.
-    """
-    context = _ForkContext() if method == "fork" else _SpawnContext()
-    if method == "spawn":
-        _start_quiet_tracker()
-    pool = ProcessPoolExecutor(count, context, _begin, (os.getpid(), begin, *arguments))
+    """Give a `process_pool`; left by an exception, the context waits for none of its processes."""
+    pool = process_pool(count, method, begin, *arguments)
     try:
         yield pool
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         raise
     pool.shutdown()
+
+
+def process_pool(
+    count: int, method: Literal["fork", "spawn"], begin: Callable[..., None], *arguments: Any
+) -> ProcessPoolExecutor:
+    """Return a pool of `count` processes, each of which calls `begin` first.
+
+    They are killed when this process dies, and when the thread that starts them ends.
+    """
+    if method == "spawn":
+        _start_quiet_tracker()
+    context = _ForkContext() if method == "fork" else _SpawnContext()
+    return ProcessPoolExecutor(count, context, _begin, (os.getpid(), begin, *arguments))
 
 
 def _start_quiet_tracker() -> None:

@@ -16,7 +16,7 @@ from soilbus.diagnosis.diagnose import NotFitted
 from soilbus.diagnosis.fleet import FALSE_DISCOVERY_RATE, Onset, diagnose_vehicle, named
 from soilbus.diagnosis.records import Record, TooLittle
 from soilbus.estimation.assembly import possible_effects, prior_of
-from soilbus.offline.parts import Job, check_version, local_log, unpacked
+from soilbus.offline.parts import Job, local_log, unpacked
 from soilbus.offline.recordings import recordings_of
 from soilbus.offline.replay import LogError
 from soilbus.pipeline.outputs import values_std
@@ -35,22 +35,14 @@ def chosen(jobs: Sequence[Job]) -> list[Job]:
     return [jobs[i] for i in np.linspace(0, len(jobs) - 1, MAX_LOGS).round().astype(int)]
 
 
-def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
+def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
     """Diagnose the logs of one vehicle together; `fault` says what cannot be diagnosed.
 
     Parameters
     ----------
     jobs
         Logs of one vehicle with one configuration, in the order of their dates.
-    version
-        Of the soilbus that asks for it.
-
-    Raises
-    ------
-    OtherVersion
-        This soilbus is of another version.
     """
-    check_version(version)
     config, database = unpacked(jobs[0].setup.content)
     record = no_findings(jobs[0].vehicle, "no log of it can be diagnosed")
     if database is None:

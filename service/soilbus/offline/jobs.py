@@ -23,8 +23,9 @@ from soilbus.can.log_formats import is_csv_of_frames
 from soilbus.config.model import Config
 from soilbus.files import opened, plain_bytes, read_all, text_lines
 from soilbus.offline import dataset
+from soilbus.offline.cluster import BatchError
 from soilbus.offline.columns import MISSING_CELLS, check_cells, separator_of
-from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
+from soilbus.offline.parts import Job, Setup, file_name, kept_of, place_of, setup_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
@@ -34,10 +35,6 @@ PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zst")
 """Each may stand behind one of a log."""
 TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
-
-
-class BatchError(Exception):
-    """Error of a batch that cannot be done to its end; the text is one line."""
 
 
 def jobs_of(
@@ -106,8 +103,10 @@ def _job(entry: Mapping[str, str], argument: str, setup: Setup, log: str) -> Job
 
 def _logs_of_parts(parts: Path | None) -> dict[str, str]:
     """Logs of which there are parts, by digest."""
-    paths = [] if parts is None else sorted(parts.glob("*.gz"))
-    return {path.stem: summary["log"] for path in paths if (summary := summary_of_part(path)) is not None}
+    if parts is None:
+        return {}
+    all_kept = {path.stem: kept_of(parts, path.stem) for path in sorted(parts.glob("*.parquet"))}
+    return {digest: kept.summary["log"] for digest, kept in all_kept.items() if kept and kept.summary}
 
 
 def _lies_in(log: str, place: str) -> bool:
