@@ -56,12 +56,12 @@ class Picture(NamedTuple):
     png: str
 
 
-class Table(NamedTuple):
-    """A table of plain texts; `numbers` are the columns to be aligned to the right."""
+class Step(NamedTuple):
+    """What to do next: a sentence, a command that does it or nothing, and more lines."""
 
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    numbers: frozenset[int] = frozenset()
+    sentence: str
+    command: str = ""
+    lines: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
