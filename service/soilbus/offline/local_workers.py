@@ -23,7 +23,7 @@ __all__ = ["KilledWorker", "LocalWorkers", "local_workers"]
 TRIES = 4
 """Processes that may die of a task before it is given up: those of Dask (distributed.scheduler.allowed-failures)."""
 LEAST_MEMORY = 2**30
-"""Memory [bytes] that each process may ask for, however many there are: a worker's peak is 369 MB (docs/fleet.md)."""
+"""Memory [bytes] that each process may ask for, however many there are: a worker takes 223 MB (docs/fleet.md)."""
 HERE = "this machine"
 
 

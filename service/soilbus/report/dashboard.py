@@ -85,7 +85,7 @@ CARRYING_SLIP = 0.6
 
 
 class Verdict(NamedTuple):
-    """Verdict in a word for block letters, in a sentence, what to do, and the kind of its colours."""
+    """Verdict in a word, in a sentence, what to do, and the kind of its colours."""
 
     word: str
     said: str
@@ -97,12 +97,6 @@ class Verdict(NamedTuple):
         """Colours of the verdict, reversed: a terminal without colour then shows it in reverse video."""
         foreground, background = COLOURS[self.kind]
         return Style(color=background, bgcolor=foreground, reverse=True, bold=True)
-
-    @property
-    def block_style(self) -> Style:
-        """Colours of a full block, also behind it, as fonts leave gaps between blocks."""
-        foreground, _ = COLOURS[self.kind]
-        return Style(color=foreground, bgcolor=foreground, reverse=True)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second;
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import sys
@@ -37,7 +38,7 @@ from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.received_record import gist, received_record
 from soilbus.words import shown
 
-__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch", "watch_log"]
+__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch"]
 
 REDRAW_PERIOD = 0.2
 """Time [s] between two pictures."""
@@ -136,17 +137,25 @@ class Pace:
 
 def watch(
     config: Config,
+    log: Path | None = None,
+    speed: float = 1.0,
     names_wheels: bool = True,
     seconds: float | None = None,
     plain: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
+    """Show the dashboard of the configured bus, or of a recording of our frames in its own time, until interrupted.
+
+    A bus that goes away is waited for; a recording ends the command.
 
     Parameters
     ----------
     config
         Of bus, output.dbc and vehicle.
+    log
+        In any format that python-can reads; None for the bus.
+    speed
+        Seconds of the recording per second.
     names_wheels
         Whether the configuration is that of the vehicle that is watched.
     seconds
@@ -160,64 +169,35 @@ def watch(
     ------
     BusError
         The bus cannot be opened at the start.
+    LogError
+        The recording cannot be read, or has no frame of ours.
     """
-    database = output_database(config)
+    database, vehicle = output_database(config), Vehicle.of(config, names_wheels)
+    until = math.inf if seconds is None else time.monotonic() + seconds
+
+    def show_from(source: Source, received: ReceivedFrames, stays: bool) -> None:
+        def done() -> bool:
+            return time.monotonic() >= until or (isinstance(source, PlayedLog) and source.is_over)
+
+        dashboard = Dashboard(received, vehicle)
+        if as_json:
+            print_results(dashboard, source, sys.stdout, done)
+        else:
+            show(dashboard, source, Console(), plain, done, stays=stays)
+
+    if log is not None:
+        ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
+        messages = (m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours)
+        pace = Pace(speed)
+        played = PlayedLog(messages, 1.0, pace, pace.sleep) if as_json else PlayedLog(messages, speed)
+        if played.is_over:
+            raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
+        show_from(played, ReceivedFrames(database, played.now), seconds is None)
+        return
     settings, filters = config.bus.model_dump(), filters_of(database)
     with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
         bus.open()
-        until = None if seconds is None else time.monotonic() + seconds
-        dashboard = Dashboard(ReceivedFrames(database), Vehicle.of(config, names_wheels))
-        _show_as(dashboard, bus, plain, as_json, lambda: until is not None and time.monotonic() >= until)
-
-
-def watch_log(
-    config: Config,
-    log: Path,
-    speed: float = 1.0,
-    names_wheels: bool = True,
-    seconds: float | None = None,
-    plain: bool = False,
-    as_json: bool = False,
-) -> None:
-    """Show the dashboard of a recording of our frames in its own time, to its end.
-
-    Parameters
-    ----------
-    config, names_wheels, seconds, plain, as_json
-        As of `watch`.
-    log
-        In any format that python-can reads.
-    speed
-        Seconds of the recording per second.
-
-    Raises
-    ------
-    LogError
-        It cannot be read, or has no frame of ours.
-    """
-    database = output_database(config)
-    ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
-    messages = (m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours)
-    pace = Pace(speed)
-    source = PlayedLog(messages, 1.0, pace, pace.sleep) if as_json else PlayedLog(messages, speed)
-    if source.is_over:
-        raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
-    until = None if seconds is None else time.monotonic() + seconds
-    dashboard = Dashboard(ReceivedFrames(database, source.now), Vehicle.of(config, names_wheels))
-    _show_as(
-        dashboard, source, plain, as_json,
-        lambda: source.is_over or (until is not None and time.monotonic() >= until),
-        stays=seconds is None,
-    )  # fmt: skip
-
-
-def _show_as(
-    dashboard: Dashboard, source: Source, plain: bool, as_json: bool, done: Callable[[], bool], stays: bool = False
-) -> None:
-    if as_json:
-        print_results(dashboard, source, sys.stdout, done)
-    else:
-        show(dashboard, source, Console(), plain, done, stays=stays)
+        show_from(bus, ReceivedFrames(database), False)
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
