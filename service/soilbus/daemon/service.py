@@ -412,17 +412,10 @@ class Service:
         return None if self._reached <= self._interrupted else self.result
 
     def present_decision(self, now: float) -> Traversability:
-        """Return the present decision.
+        """Return the decision of the last window, judged at `now` [s].
 
-        Parameters
-        ----------
-        now
-            Monotonic time [s].
-
-        Returns
-        -------
-        The decision of the last window, judged at `now`; unknown while an input is stale or a fault holds, and until
-        a window has data from after the last interruption.
+        It is unknown while an input is stale or a fault holds, and until a window has data from after the last
+        interruption.
         """
         if self._interruption(now) is not None:
             return Traversability()

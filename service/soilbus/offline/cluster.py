@@ -86,12 +86,8 @@ def done_in_turn(
 ) -> Iterator[tuple[str, Any]]:
     """Yield results as they come, by key; the exception itself where a task failed.
 
-    Tasks are drawn one by one as others end, so that what travels with them is never in memory all at once.
-
-    Raises
-    ------
-    BatchError
-        The scheduler is lost.
+    Tasks are drawn one by one as others end, so that what travels with them is never in memory all at once. BatchError
+    where the scheduler is lost.
     """
     executor, waiting = client.get_executor(pure=False), iter(tasks)
     running: dict[Future[Any], str] = {}

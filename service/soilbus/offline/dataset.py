@@ -70,12 +70,7 @@ def put(path: Path, content: bytes) -> None:
 def write_windows(out: Path, parts: Sequence[Path]) -> None:
     """Write the windows of all parts as tables by vehicle and day, and the map of them; nothing without parts.
 
-    Raises
-    ------
-    BatchError
-        A part cannot be read, or a table not be written.
-    NotWritten
-        The map cannot be written.
+    BatchError where a part cannot be read or a table not be written, NotWritten for the map.
     """
     import pyarrow as pa
     import pyarrow.dataset as ds
@@ -108,16 +103,9 @@ def log_rows(summaries: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of vehicles.parquet.
+    """Return the rows of vehicles.parquet from those of logs.parquet and errors.parquet.
 
-    Parameters
-    ----------
-    logs, errors
-        Rows of logs.parquet and errors.parquet.
-
-    Returns
-    -------
-    One row for each vehicle: counts added up, the mean bearing pressure over valid windows, first begin and last end.
+    Counts are added up; with them stand the mean bearing pressure over valid windows, the first begin and the last end.
     """
     rows = []
     for vehicle, (own, faults) in sorted(_by_vehicle(logs, errors).items()):

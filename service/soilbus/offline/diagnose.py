@@ -88,16 +88,7 @@ def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Con
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
-    """Read logs and diagnose them together.
-
-    Parameters
-    ----------
-    config
-        The vehicle's configuration; with [table] `logs` are tables.
-    logs
-        Files.
-    say
-        Called with the name of each phase.
+    """Read logs, or with [table] tables, and diagnose them together; `say` is called with the name of each phase.
 
     Raises
     ------

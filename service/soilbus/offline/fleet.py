@@ -36,13 +36,7 @@ def chosen(jobs: Sequence[Job]) -> list[Job]:
 
 
 def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
-    """Diagnose the logs of one vehicle together; `fault` says what cannot be diagnosed.
-
-    Parameters
-    ----------
-    jobs
-        Logs of one vehicle with one configuration, in the order of their dates.
-    """
+    """Diagnose the logs of one vehicle, in the order of their dates; `fault` says what cannot be diagnosed."""
     config, database = unpacked(jobs[0].setup.content)
     record = no_findings(jobs[0].vehicle, "no log of it can be diagnosed")
     if database is None:
@@ -102,16 +96,9 @@ def no_findings(vehicle: str, fault: str) -> dict[str, Any]:
 
 
 def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the fleet's diagnosis.
+    """Return the fleet's diagnosis from the findings of each vehicle with its configuration.
 
-    Parameters
-    ----------
-    findings
-        Of each vehicle, with its configuration.
-
-    Returns
-    -------
-    These, `named` with each effect, and for each effect the share of vehicles that are expected to have it.
+    It has these, `named` with each effect, and for each effect the share of vehicles that are expected to have it.
     """
     effects = [effect for each in findings for effect in each["effects"]]
     for effect, given in zip(effects, named([effect["probability"] for effect in effects]), strict=True):

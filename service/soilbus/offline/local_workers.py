@@ -34,12 +34,7 @@ class KilledWorker(Exception):
 class LocalWorkers:
     """Processes of this machine with the methods of a Dask client that a batch uses.
 
-    Parameters
-    ----------
-    count
-        Number of processes.
-    folder
-        For the temporary files of the processes; only this user may read it.
+    Their temporary files are in `folder`, which only this user may read.
     """
 
     def __init__(self, count: int, folder: str) -> None:

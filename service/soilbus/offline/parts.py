@@ -59,14 +59,8 @@ NO_DAY = "unknown"
 class Setup:
     """A configuration with its databases, as it travels to a worker.
 
-    Attributes
-    ----------
-    name
-        File that it came from.
-    content
-        Pickled Config and Database (None for tables of a test rig).
-    digest
-        Of the settings and the DBC files.
+    The content is pickled: Config and Database (None for tables of a test rig). The digest is of settings and DBC
+    files.
     """
 
     name: str
@@ -137,13 +131,7 @@ class Outcome:
 
 
 def setup_of(config: Config, name: str) -> Setup:
-    """Return the setup of a configuration.
-
-    Raises
-    ------
-    ConfigError
-        A DBC file is missing or does not fit the configuration.
-    """
+    """Return the setup of a configuration; ConfigError where a DBC file is missing or does not fit."""
     digest = hashlib.sha256((config.model_dump_json() + (config.log_channel or "")).encode())
     database = None
     if config.table is None:
@@ -244,10 +232,7 @@ def _check_is_file(path: Path) -> None:
 def local_log(job: Job) -> Iterator[Path]:
     """Give the path of the log on this machine, for as long as the context lasts.
 
-    Raises
-    ------
-    LogError
-        The URL cannot be read, or the log is neither here nor was it sent along.
+    LogError where the URL cannot be read, or the log is neither here nor was it sent along.
     """
     if job.content is None and "://" not in job.log:
         if job.not_sent is not None and not Path(job.log).exists():
@@ -371,14 +356,7 @@ class _Summary:
 class Kept:
     """What came of a log, as in an Outcome, with the bytes of its part and the state of its file.
 
-    Attributes
-    ----------
-    fault, summary, other_bus
-        As of the Outcome.
-    part_bytes
-        Size of its part; 0 where there is none.
-    size, changed
-        Of the log: bytes, time of change [ns] where it is known.
+    Of the log it has the size and, where that is known, the time of change [ns].
     """
 
     fault: str | None

@@ -109,14 +109,9 @@ def recordings_of(
 
 
 def check_different(logs: Sequence[Path]) -> None:
-    """Refuse a recording that is given twice, as one file or as a copy.
+    """Refuse a recording that is given twice, as one file or as a copy, with a LogError.
 
     Files that differ in size are not read.
-
-    Raises
-    ------
-    LogError
-        Two logs are the same file or have the same bytes, or one of two of the same size cannot be read.
     """
     known = [(log, log.stat()) for log in logs if os.path.exists(log)]
     _check_unlike((log, (status.st_dev, status.st_ino)) for log, status in known)
@@ -152,10 +147,7 @@ def parts(
 ) -> Iterator[Window]:
     """Yield the windows of a log, one for each stretch without a set clock or a long silence.
 
-    Raises
-    ------
-    LogError
-        The log cannot be read to its end; with `partial` only where nothing of it can.
+    LogError where the log cannot be read to its end; with `partial` only where nothing of it can.
     """
     whole: list[Window] = []
 

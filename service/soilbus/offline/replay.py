@@ -159,16 +159,7 @@ def _windows(intake: Intake, log: Path, progress: Callable[[int, float], None] |
 
 
 def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
-    """Feed the frames of a log to an intake.
-
-    Parameters
-    ----------
-    intake
-        Takes the frames.
-    log
-        The file.
-    progress
-        Called with the number of frames read and the time in the recording [s].
+    """Feed the frames of a log to an intake, and say how far it is.
 
     Yields
     ------

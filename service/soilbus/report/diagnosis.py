@@ -17,14 +17,7 @@ from soilbus.report.statement import doubt, headline, is_open, plain_gap, statem
 def diagnosis_report(findings: Findings, source: Source, model_out: Path | None = None) -> str:
     """Return the whole page: verdict and pictures first, then what to do next, and all findings folded away.
 
-    Parameters
-    ----------
-    findings
-        The diagnosis.
-    source
-        Configuration and logs.
-    model_out
-        Where the completed model was written to; None where it was not.
+    `model_out` is where the completed model was written to.
     """
     diagnosis = findings.diagnosis
     added = diagnosis.completed is not diagnosis.base

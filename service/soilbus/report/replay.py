@@ -26,17 +26,7 @@ from soilbus.report.windows import by_reason, machine_line, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
-    """Return the whole page of a replay.
-
-    Parameters
-    ----------
-    results
-        Every window.
-    text
-        Their summary.
-    source
-        Configuration and logs.
-    """
+    """Return the whole page of a replay, with the text of its summary."""
     shown = list(_pictures(results, source.config))
     curves = (
         "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate; its band is"

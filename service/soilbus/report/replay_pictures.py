@@ -85,15 +85,7 @@ def dates(results: Sequence[WindowResult]) -> str:
 
 
 class TimeAxis:
-    """Time axis with recordings one after the other.
-
-    Parameters
-    ----------
-    results
-        Every window, at least one.
-    hop
-        [s], for which a window's decision stands.
-    """
+    """Time axis with recordings one after the other; a window's decision stands for `hop` [s]."""
 
     def __init__(self, results: Sequence[WindowResult], hop: float) -> None:
         self.parts = stretches(results)

@@ -60,16 +60,9 @@ class Source(Protocol):
 
 
 class PlayedLog:
-    """Frames of a recording, each when it is due.
+    """Frames of a recording, each when it is due by a clock [s], `speed` times as fast as they came.
 
-    Parameters
-    ----------
-    messages
-        In their order; one whose stamp goes back is due at once, and a silence takes LONGEST_GAP at most.
-    speed
-        Seconds of the recording per second.
-    clock, sleep
-        Monotonic time [s] and waiting by it.
+    One whose stamp goes back is due at once, and a silence takes LONGEST_GAP at most.
     """
 
     fault = ""
@@ -114,13 +107,7 @@ class PlayedLog:
 
 
 class Pace:
-    """Clock of a recording that is played: only `sleep` moves it on.
-
-    Parameters
-    ----------
-    speed
-        Seconds of the recording per second.
-    """
+    """Clock of a recording that is played `speed` times as fast: only `sleep` moves it on."""
 
     def __init__(self, speed: float) -> None:
         self._speed, self._began, self._now = speed, time.monotonic(), 0.0
@@ -146,24 +133,9 @@ def watch(
 ) -> None:
     """Show the dashboard of the configured bus, or of a recording of our frames in its own time, until interrupted.
 
-    A bus that goes away is waited for; a recording ends the command.
-
-    Parameters
-    ----------
-    config
-        Of bus, output.dbc and vehicle.
-    log
-        In any format that python-can reads; None for the bus.
-    speed
-        Seconds of the recording per second.
-    names_wheels
-        Whether the configuration is that of the vehicle that is watched.
-    seconds
-        After which to stop; None for never.
-    plain
-        Lines, even on a terminal.
-    as_json
-        A line of JSON for each window.
+    A bus that goes away is waited for; a recording ends the command. With `names_wheels` the configuration is that of
+    the vehicle that is watched. After `seconds` it stops. `plain` gives lines even on a terminal, `as_json` a line of
+    JSON for each window.
 
     Raises
     ------
@@ -219,22 +191,8 @@ def show(
 ) -> None:
     """Feed frames and show them until `done`, or until a key ends it.
 
-    Parameters
-    ----------
-    dashboard
-        Takes the frames.
-    source
-        An open bus or a recording.
-    console
-        Where to draw; not a terminal, or one that moves no cursor: lines.
-    plain
-        Lines, even on a terminal.
-    done
-        Whether to stop, asked in every round.
-    clock
-        Monotonic time [s].
-    stays
-        Whether the last page stays until a key says so, where keys can be pressed.
+    Where the console is no terminal, or moves no cursor, or with `plain`, these are lines. With `stays` the last page
+    stays until a key says so.
     """
     if plain or not console.is_terminal or console.is_dumb_terminal:
         _show_lines(dashboard, source, console, done, clock)
@@ -281,16 +239,9 @@ def print_results(
     out: IO[str],
     done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Print a line of JSON for each received window, and for each change of state in between.
+    """Print a line of JSON for each received window, and for each change of state in between; each is flushed.
 
     A window's line waits for the verdict that rests on it, at most a cycle of the fast frames.
-
-    Parameters
-    ----------
-    dashboard, source, done
-        As of `show`.
-    out
-        Takes the lines; each is flushed.
     """
     received, said, stamp = dashboard.known, None, None
     first = received.now + FIRST_VERDICT

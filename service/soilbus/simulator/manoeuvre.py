@@ -91,13 +91,7 @@ class Manoeuvre:
 
 
 def of_json(text: str) -> Manoeuvre:
-    """Return a manoeuvre from its JSON, or from the `manoeuvre` of a diagnosis.
-
-    Raises
-    ------
-    ValueError
-        The text is no JSON, or has no manoeuvre.
-    """
+    """Return a manoeuvre from its JSON, or from the `manoeuvre` of a diagnosis; ValueError where there is none."""
     try:
         document = json.loads(text)
     except ValueError:

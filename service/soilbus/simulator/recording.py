@@ -43,21 +43,8 @@ class Recording:
 def simulate(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Recording:
     """Drive the configured vehicle through a scenario and measure it; the same seed gives the same recording.
 
-    Parameters
-    ----------
-    config
-        The vehicle, with the effects of config.model.effects.
-    scenario
-        What to drive.
-    seed
-        Picks slips, loads, noise and gain errors.
-    effects
-        Further effects.
-
-    Raises
-    ------
-    SimulationError, KeyError, ConfigError
-        As `drive.drive`.
+    Effects are those of config.model.effects and `effects`. The seed picks slips, loads, noise and gain errors. Errors
+    are those of `drive.drive`.
     """
     return recorded(drive(config, scenario, seed, effects), config, scenario, seed)
 

@@ -90,17 +90,7 @@ class Wave(NamedTuple):
 
 
 def realise(swing: Swing | Profile, t: Array, rng: np.random.Generator) -> Wave:
-    """Return a random wave.
-
-    Parameters
-    ----------
-    swing
-        Its bounds and frequencies, or given values, which are returned as they are.
-    t
-        Times [s] (N,), ascending from 0.
-    rng
-        Picks frequencies and phases.
-    """
+    """Return a random wave at times [s] (N,) that ascend from 0; given values are returned as they are."""
     if isinstance(swing, Profile):
         value = np.interp(t, swing.t, swing.value)
         area = np.cumsum((value[1:] + value[:-1]) / 2.0 * np.diff(t))
