@@ -394,50 +394,16 @@ def test_soilbus_is_gone_when_its_frames_stop_and_for_how_long(desk):
     assert desk.dashboard.verdict().word == "GO"
 
 
-def waiting_for_first_window(desk: Desk, seconds: int) -> list[str]:
-    said = []
-    for _ in range(seconds):
-        desk.send("SoilbusStatus", State="estimating", Reason="none")
-        desk.send("SoilbusIdentity", Uptime=500)
-        desk.send("Traversability", State="unknown")
-        said.append(desk.dashboard.verdict().said)
-        desk.clock.now += 1.0
-    return said
-
-
-def test_the_first_window_is_counted_down_from_when_inputs_began(desk):
+def test_before_the_first_window_it_is_said_how_long_that_takes():
+    desk = Desk(Vehicle(window=5.0))
     desk.send("SoilbusStatus", State="listening", Reason="no_frames")
     desk.send("Traversability", State="unknown")
     assert "nothing on the bus" in desk.dashboard.verdict().said
-    desk.clock.now += 1.0
-    said = waiting_for_first_window(desk, 12)
-    assert said[0] == "UNKNOWN: 10 s until the first window"
-    assert said[7] == "UNKNOWN: 3 s until the first window"
-    assert said[11] == "UNKNOWN: the first window is due"
+    desk.send("SoilbusStatus", State="estimating", Reason="none")
+    assert desk.dashboard.verdict().said == "UNKNOWN: the first window takes 5 s"
     desk.send("SoilbusStatus", State="valid", Reason="none", Window=0)
     desk.send("Traversability", State="go", Probability=0.99)
     assert desk.dashboard.verdict().word == "GO"
-
-
-def test_who_comes_later_knows_only_how_long_the_first_window_takes_at_most():
-    desk = Desk(Vehicle(window=5.0))
-    said = waiting_for_first_window(desk, 3)
-    assert said[2] == "UNKNOWN: at most 3 s until the first window"
-
-
-@pytest.mark.parametrize("uptime", [0, 500])
-def test_the_first_window_is_counted_down_again_after_a_restart_and_after_the_clock_was_set(desk, uptime):
-    waiting_for_first_window(desk, 3)
-    for _ in range(20 if uptime else 1):  # a restart may come before there was a window
-        desk.send(
-            "SoilbusStatus", State="valid" if uptime else "estimating", Reason="none", Window=7 if uptime else None
-        )
-        desk.send("SoilbusIdentity", Uptime=500)
-        desk.clock.now += 1.0
-    desk.send("SoilbusIdentity", Uptime=uptime)
-    desk.send("Traversability", State="unknown")
-    desk.send("SoilbusStatus", State="estimating", Reason="none")
-    assert desk.dashboard.verdict().said == "UNKNOWN: 10 s until the first window"
 
 
 def test_an_estimate_that_is_not_there_yet_is_not_called_old(desk):

@@ -49,7 +49,6 @@ MOVING_ADVICE = "Lift, add no torque"
 HELD = "Go slowly, caution is held"
 ABOVE_BEST = "Keep going, slip above best"
 GONE_ADVICE = "Rely on your own judgement"
-FIRST_IS_DUE = "the first window is due"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
     "go": ("#000000", "#00d700"),
@@ -169,8 +168,6 @@ class Dashboard:
     span: float = 60.0
     _samples: deque[tuple[float, dict[str, float]]] = field(default_factory=deque, repr=False)
     _began: float = math.nan
-    _inputs_since: float | None = None
-    _saw_them_begin: bool = False
 
     def __post_init__(self) -> None:
         self._began = self.known.now
@@ -178,7 +175,6 @@ class Dashboard:
     def sample(self) -> None:
         """Take the present values into the history; call it for each frame and each picture."""
         now, known = self.known.now, self.known
-        self._watch_for_inputs()
         if self._samples and 0.0 <= now - self._samples[-1][0] < SAMPLE_PERIOD:
             return
         values = {
@@ -259,15 +255,13 @@ class Dashboard:
         if known.is_unproven:
             return f"waiting for {IN_A_ROW} frames in a row", MEASURING
         reason = str(known.value("SoilbusStatus", "Reason"))
-        left = self.until_first_window()
-        if left is not None and reason in ("none", "None", "not_excited", "model_gap"):
-            return left, MEASURING
-        if left is not None and left != FIRST_IS_DUE and reason == "input_missing":
-            return f"starting, {left}", MEASURING
         if known.value("SoilbusStatus", "State") is None:
             return "no status of soilbus", MEASURING
         if known.value("SoilbusStatus", "State") == "starting":
             return "soilbus is starting", MEASURING
+        has_no_window = known.number("SoilbusStatus", "Window") is None
+        if has_no_window and reason in ("none", "None", "not_excited", "model_gap"):
+            return f"the first window takes {self.vehicle.window:g} s", MEASURING
         if (
             reason not in REASONS
             and not known.is_stale("PresentDemand")
@@ -283,29 +277,6 @@ class Dashboard:
         if known.value("SoilbusStatus", "State") == "estimating":
             return "the next window is due", MEASURING
         return "the estimate is too old", MEASURING
-
-    def _watch_for_inputs(self) -> None:
-        """Since when the service has had inputs, as a first window needs `window` seconds of them."""
-        state, reason, window = (self.known.value("SoilbusStatus", name) for name in ("State", "Reason", "Window"))
-        if state is None:
-            return
-        if window is not None or state in ("starting", "waiting") or reason in ("no_frames", "bus_down"):
-            self._inputs_since, self._saw_them_begin = None, True
-            return
-        uptime = self.known.number("SoilbusIdentity", "Uptime")
-        has_begun = uptime is not None and uptime < 2.0
-        if self._inputs_since is None or has_begun:
-            self._saw_them_begin |= has_begun
-            self._inputs_since = self.known.now - (uptime if uptime is not None and has_begun else 0.0)
-
-    def until_first_window(self) -> str | None:
-        """Return how long until the first window has ended; None once there was one, or without inputs."""
-        if self._inputs_since is None or self.known.number("SoilbusStatus", "Window") is not None:
-            return None
-        left = math.ceil(self.vehicle.window - (self.known.now - self._inputs_since))
-        if left <= 0:
-            return FIRST_IS_DUE
-        return f"{'' if self._saw_them_begin else 'at most '}{left} s until the first window"
 
     def slip(self) -> Slip:
         """Return the slip and set-points of the wheel that slips most; unknown axle: the smaller set-points of both."""
