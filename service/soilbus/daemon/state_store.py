@@ -87,14 +87,7 @@ class _File(_Model):
 class Owner:
     """Owner of a state: a digest of all that a posterior depends on, and the bounds of such a posterior.
 
-    Attributes
-    ----------
-    key
-        Digest of configuration and signals.
-    gains
-        Names of the gain errors (G,).
-    median, std
-        Of the soil parameters (6,) and the gain errors (G,); sd 0 means held.
+    Median and std are of the soil parameters (6,) and the gain errors (G,), whose names are `gains`; sd 0 means held.
     """
 
     key: str

@@ -27,13 +27,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_table(path: Path, results: Iterable[WindowResult], config: Config) -> None:
-    """Write the windows to a .parquet file, or to a CSV file under any other name.
-
-    Raises
-    ------
-    NotWritten
-        The file cannot be written.
-    """
+    """Write the windows to a .parquet file, or to a CSV file under any other name; NotWritten."""
     rows = [flat_record(window_record(result, config)) for result in results]
     if path.suffix == ".parquet":
         with whole_file_of_bytes(path) as binary:

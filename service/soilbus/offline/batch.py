@@ -46,22 +46,11 @@ MAX_SENT_BYTES = 256 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Result of a batch.
+    """Result of a batch: rows of vehicles.parquet and errors.parquet, and what else the command says.
 
-    Attributes
-    ----------
-    vehicles
-        Rows of vehicles.parquet.
-    errors
-        Rows of errors.parquet.
-    windows
-        Windows of all logs.
-    resumed, failed_before
-        Logs that were done before this run, and those of them whose fault was kept.
-    fleet
-        Content of diagnosis.json; None where it was not asked for.
-    stale_diagnosis
-        Whether that of an earlier run was there, and is removed.
+    Of the logs that were done before this run (`resumed`) those of a kept fault are `failed_before`. `fleet` is the
+    content of diagnosis.json where that was asked for; `stale_diagnosis`: that of an earlier run was there, and is
+    removed.
     """
 
     vehicles: list[dict[str, Any]]
@@ -111,22 +100,10 @@ def run_batch(
     diagnose: bool = False,
     retry: bool = False,
 ) -> Batch:
-    """Replay all logs that are not done yet, then write the results of all.
+    """Replay all logs that are not done yet, then write the results of all into a folder.
 
-    Parameters
-    ----------
-    client
-        Of `cluster`.
-    jobs
-        The logs.
-    out
-        Folder for the results.
-    progress
-        Called with what is done.
-    diagnose
-        Whether to diagnose each vehicle over its logs, and the fleet.
-    retry
-        Whether to read logs that failed or were damaged again, and to diagnose vehicles again that lack a log.
+    With `diagnose` each vehicle is diagnosed over its logs, and the fleet. With `retry` logs that failed or were
+    damaged are read again, and vehicles diagnosed again that lack a log. `progress` is called with what is done.
 
     Raises
     ------

@@ -28,17 +28,8 @@ class BatchError(Exception):
 def cluster(address: str | None, processes: int | None = None) -> Iterator[Any]:
     """Give a Dask client of the scheduler at an address, or processes of this machine with the same use.
 
-    Parameters
-    ----------
-    address
-        Such as tcp://10.0.0.1:8786; None for this machine, where no port is opened.
-    processes
-        Of this machine; one for each core by default.
-
-    Raises
-    ------
-    BatchError
-        There is no scheduler, it has no workers, or these have another soilbus.
+    Without an address no port is opened, and there is a process for each core by default. BatchError where there is no
+    scheduler, it has no workers, or these have another soilbus.
     """
     if address is None:
         with local_workers(processes) as local:

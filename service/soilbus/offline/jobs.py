@@ -40,24 +40,12 @@ MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
 def jobs_of(
     config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config], parts: Path | None = None
 ) -> list[Job]:
-    """Return the jobs that the arguments of the command stand for, in the order of vehicle and log.
+    """Return a job for each log that the arguments of the command stand for, in the order of vehicle and log.
 
-    Parameters
-    ----------
-    config, name
-        The configuration for logs that have none of their own, and its file's name.
-    logs
-        Logs, folders, globs, URLs, or manifests: tables (CSV, Parquet) with a column `log`, and optionally `vehicle`,
-        `configuration` and `start` (ISO 8601, or seconds since 1970).
-    load
-        Reads another configuration.
-    parts
-        Folder of parts to go on with: a log that was read before in a folder that is named here, and that is no longer
-        there, keeps its job.
-
-    Returns
-    -------
-    One job for each log.  Where no manifest names the vehicle, it is that of the folder in which the log lies.
+    An argument is a log, a folder, a glob, a URL, or a manifest: a table (CSV, Parquet) with a column `log`, and
+    optionally `vehicle`, `configuration`, which `load` reads, and `start` (ISO 8601, or seconds since 1970). Without a
+    vehicle there it is that of the folder in which the log lies. A log that was read before in a folder that is named
+    here, of which `parts` holds the windows and that is no longer there, keeps its job.
 
     Raises
     ------

@@ -108,17 +108,9 @@ def _manoeuvre(chosen: Mapping[str, Pattern]) -> Manoeuvre:
 class Plan:
     """The manoeuvre, and between which names it decides.
 
-    Attributes
-    ----------
-    manoeuvre, between
-        What to drive, and the rivals' names.
-    separations
-        S by the name that is true and by its rival.
-    expected_probability
-        That of the right name after one such drive, whichever it is.
-    repeats
-        How often it must be driven until the right name stands alone, as S grows with the time; None for more than
-        MAX_REPEATS.
+    `separations` holds S by the name that is true and by its rival, `expected_probability` that of the right name after
+    one such drive, whichever it is. After `repeats` drives, as S grows with the time, the right name stands alone; None
+    for more than MAX_REPEATS.
     """
 
     manoeuvre: Manoeuvre

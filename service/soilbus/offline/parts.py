@@ -70,22 +70,10 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A log to replay.
+    """A log to replay: absolute path or URL, the vehicle that recorded it, and this one's configuration.
 
-    Attributes
-    ----------
-    log
-        Absolute path, or URL that fsspec opens.
-    vehicle
-        That recorded it.
-    setup
-        Configuration of the vehicle.
-    start
-        Time [s] of the first sample, for logs whose stamps are no dates; None: stamps count as they are.
-    content
-        The log itself, where workers do not see the file.
-    not_sent
-        Why it was not sent along, in one line, where workers do not see the file.
+    `start` is the time [s] of the first sample, for logs whose stamps are no dates. Where workers do not see the file,
+    `content` is the log itself, or `not_sent` says in one line why it was not sent along.
     """
 
     log: str
@@ -104,22 +92,10 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of a log.
+    """Result of a log: why it was not read, or not to its end, in one line; summary and Parquet file of its windows.
 
-    Attributes
-    ----------
-    fault
-        Why the log was not read, or not to its end, in one line; None where it was.
-    summary
-        Of its windows; None where there are none.
-    part
-        A Parquet file of its windows.
-    other_bus
-        Whether no frame of the log is in the DBC.
-    lasting
-        Whether the fault is of what is in the log, so that the same file has it again; else of the place or machine.
-    size
-        Of the log, in bytes.
+    `other_bus`: no frame of it is in the DBC. `lasting`: the fault is of what is in the log, so that the same file has
+    it again; else of the place or machine. `size` is that of the log in bytes.
     """
 
     fault: str | None

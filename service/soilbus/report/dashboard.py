@@ -102,18 +102,8 @@ class Verdict(NamedTuple):
 class Vehicle:
     """Names and limits that a configuration adds to the frames.
 
-    Attributes
-    ----------
-    wheels
-        Names in the order of the frames; empty where no configuration names them.
-    axles
-        Of each of these wheels `Front`, or `Rear` behind the first axle, as in the names of signals.
-    window
-        Length of an estimation window [s].
-    max_slip
-        Slip at the end of the slip bar.
-    go
-        Probability from which the state is go, once enough windows say so.
+    Wheels are named in the order of the frames, or not at all; axles are `Front` or `Rear` as in the names of signals.
+    A window is `window` [s] long, the slip bar ends at `max_slip`, and the state is go from the probability `go` on.
     """
 
     wheels: tuple[str, ...] = ()
@@ -150,16 +140,7 @@ class Slip(NamedTuple):
 class Dashboard:
     """Received frames and their last minute, as the dashboard shows them.
 
-    Attributes
-    ----------
-    known
-        The received frames.
-    vehicle
-        What the configuration adds to them.
-    fault
-        Why the bus is away; empty while it is there.
-    span
-        Time [s] that the charts show.
+    `fault` says why the bus is away; it is empty while it is there. Charts show the last `span` seconds.
     """
 
     known: ReceivedFrames

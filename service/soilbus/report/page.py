@@ -66,21 +66,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Recordings and configuration of a report.
-
-    Attributes
-    ----------
-    config
-        The vehicle and the settings.
-    file
-        The configuration's file; None for one that is in no file.
-    overrides
-        KEY=VALUE that were in force over it.
-    logs
-        The recordings.
-    made
-        When.
-    """
+    """Recordings and configuration of a report: the configuration's file, if any, and KEY=VALUE in force over it."""
 
     config: Config
     file: Path | None = None

@@ -22,18 +22,9 @@ __all__ = ["NORTHWARD", "Course", "course", "positions"]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Course of a drive over the ground: a start, a heading and rows.
+    """Course of a drive over the ground: a start [rad], the heading [rad] of the first row clockwise from north, rows.
 
-    Attributes
-    ----------
-    latitude, longitude
-        Start [rad].
-    heading
-        Of the first row [rad], clockwise from north.
-    row
-        Length of a row [m]; inf for a straight line.
-    spacing
-        Distance [m] of each row to the right of the one before.
+    A row is `row` [m] long, inf for a straight line; each lies `spacing` [m] to the right of the one before.
     """
 
     latitude: float = math.radians(52.43)

@@ -20,18 +20,9 @@ __all__ = ["Recording", "recorded", "simulate"]
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A simulated drive.
+    """A simulated drive: true values (see drive.Drive) and noisy samples by channel name, in SI, of one seed.
 
-    Attributes
-    ----------
-    truth
-        True values (N,) by column name, SI (see drive.Drive).
-    channels
-        Noisy samples by channel name, SI.
-    seed
-        Of the realisation.
-    bogged_at
-        Time [s] at which the tractor got stuck and the recording ends; None where it did not.
+    `bogged_at` is the time [s] at which the tractor got stuck and the recording ends; None where it did not.
     """
 
     truth: dict[str, NDArray[Any]]
