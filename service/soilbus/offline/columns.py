@@ -94,13 +94,17 @@ def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
     """Rows of a file with cells, and what separates these."""
     try:
         with opened(path) as stream:
-            lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
-            first = next((line for line in lines if line.strip()), "")
-            separator = separator_of(first, needed)
-            rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)
-            return [row for row in rows if row], separator
+            return csv_rows(stream, needed)
     except (ValueError, csv.Error) as error:
         raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
+
+
+def csv_rows(stream: Any, names: Collection[str]) -> tuple[list[list[str]], str]:
+    """Return the rows of a stream's text that have cells, and the separator of these (see `separator_of`)."""
+    lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
+    first = next((line for line in lines if line.strip()), "")
+    separator = separator_of(first, names)
+    return [row for row in csv.reader(chain([first], lines), delimiter=separator, strict=True) if row], separator
 
 
 def separator_of(header: str, names: Collection[str]) -> str:
@@ -113,8 +117,8 @@ def separator_of(header: str, names: Collection[str]) -> str:
     """
 
     def found(separator: str) -> tuple[int, int]:
-        cells = {cell.strip() for row in csv.reader([header], delimiter=separator) for cell in row}
-        return len(cells & set(names)), header.count(separator)
+        cells = {cell.strip().lower() for row in csv.reader([header], delimiter=separator) for cell in row}
+        return len(cells & {name.lower() for name in names}), header.count(separator)
 
     return max(SEPARATORS, key=found)
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from soilbus.export.table import arrow_schema, table_columns
 from soilbus.files import whole_file_of_bytes
+from soilbus.grouping import grouped
 from soilbus.offline.cluster import BatchError
 from soilbus.offline.parts import ROW_GROUP
 from soilbus.pipeline.outputs import column_names
@@ -108,7 +109,9 @@ def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str
     Counts are added up; with them stand the mean bearing pressure over valid windows, the first begin and the last end.
     """
     rows = []
-    for vehicle, (own, faults) in sorted(_by_vehicle(logs, errors).items()):
+    logs_of, errors_of = (grouped(table, lambda each: str(each["vehicle"])) for table in (logs, errors))
+    for vehicle in sorted(logs_of.keys() | errors_of.keys()):
+        own, faults = logs_of.get(vehicle, []), errors_of.get(vehicle, [])
         row: dict[str, Any] = {
             "vehicle": vehicle,
             "logs.all": len({str(each["log"]) for each in (*own, *faults)}),
@@ -126,15 +129,6 @@ def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str
         row["bearing_pressure.mean"] = sum(m * n for m, n in known) / sum(n for _, n in known) if known else None
         rows.append({name: value for name, value in row.items() if name not in ("fault", "log", "configuration")})
     return rows
-
-
-def _by_vehicle(*tables: Sequence[Mapping[str, Any]]) -> dict[str, tuple[list[Mapping[str, Any]], ...]]:
-    """The rows of each table that are of one vehicle."""
-    found: dict[str, tuple[list[Mapping[str, Any]], ...]] = {}
-    for i, rows in enumerate(tables):
-        for row in rows:
-            found.setdefault(str(row["vehicle"]), tuple([] for _ in tables))[i].append(row)
-    return found
 
 
 def _write_map(path: Path, rows: Any) -> None:

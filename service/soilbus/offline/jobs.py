@@ -5,7 +5,6 @@ LOG...  ->  rows of a manifest, or one row that names LOG itself  ->  logs of ea
 
 from __future__ import annotations
 
-import csv
 import glob
 import math
 import os
@@ -21,10 +20,10 @@ from typing import Any, BinaryIO
 
 from soilbus.can.log_formats import is_csv_of_frames
 from soilbus.config.model import Config
-from soilbus.files import opened, plain_bytes, read_all, text_lines
+from soilbus.files import opened, plain_bytes, read_all
 from soilbus.offline import dataset
 from soilbus.offline.cluster import BatchError
-from soilbus.offline.columns import MISSING_CELLS, check_cells, separator_of
+from soilbus.offline.columns import MISSING_CELLS, check_cells, csv_rows
 from soilbus.offline.parts import Job, Setup, file_name, kept_of, place_of, setup_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
@@ -179,14 +178,11 @@ def _is_machine(configuration: Path) -> bool:
 
 
 def _csv_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
-    """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
-    text = text_lines(plain_bytes(BytesIO(read_all(file))))
-    first = next(text, "")
-    table = csv.reader(chain([first], text), delimiter=separator_of(first.lower(), MANIFEST_COLUMNS), strict=True)
-    header = [name.strip().lower() for name in next(table, [])]
-    if "log" not in header:
-        return header, []
-    return header, [(table.line_num, dict(zip(header, row, strict=False))) for row in table if any(map(str.strip, row))]
+    """Names of columns, and the rows of a manifest that are not empty with their numbers."""
+    rows, _ = csv_rows(file, MANIFEST_COLUMNS)
+    header = [name.strip().lower() for name in (rows or [[]])[0]]
+    numbered = ((n, row) for n, row in enumerate(rows[1:], 2) if any(map(str.strip, row)))
+    return header, [(n, dict(zip(header, row, strict=False))) for n, row in numbered]
 
 
 def _parquet_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
