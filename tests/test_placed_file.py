@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import threading
 from pathlib import Path
@@ -13,18 +12,8 @@ import pytest
 from soilbus.files import NotWritten, placed, whole_file, whole_file_of_bytes
 
 
-@pytest.fixture(params=[True, False], ids=["unnamed", "hidden"])
-def folder(request, tmp_path: Path, monkeypatch) -> Path:
-    """On a file system that has files without names, and on one that has not."""
-    if not request.param:
-        usual = os.open
-
-        def refusing(path, flags, *args, **kwargs):
-            if flags & os.O_TMPFILE == os.O_TMPFILE:
-                raise OSError(errno.EOPNOTSUPP, "Operation not supported")
-            return usual(path, flags, *args, **kwargs)
-
-        monkeypatch.setattr(os, "open", refusing)
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
@@ -80,10 +69,11 @@ def test_a_pipe_and_a_device_are_written_to_and_stay(folder: Path):
     assert Path("/dev/null").is_char_device()
 
 
-def test_what_a_killed_process_left_under_a_hidden_name_is_in_nobodys_way(folder: Path):
-    (folder / f".soilbus-{os.getpid()}").write_text("left")
-    put(folder / "out", b"x")
-    assert list(folder.iterdir()) == [folder / "out"]
+def test_two_files_of_one_folder_can_be_written_at_once(folder: Path):
+    with whole_file(folder / "one") as one, whole_file(folder / "other") as other:
+        one.write("1")
+        other.write("2")
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {"one": "1", "other": "2"}
 
 
 @pytest.mark.parametrize("opened", [whole_file, whole_file_of_bytes])

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import queue
 import shutil
 from pathlib import Path
 
@@ -16,7 +14,7 @@ import soilbus
 from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
-from soilbus.offline.batch import BatchError, jobs_of, run_batch, workers_watched
+from soilbus.offline.batch import BatchError, jobs_of, run_batch
 from soilbus.offline.parts import Outcome
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
@@ -134,45 +132,6 @@ def test_the_summaries_count_what_the_windows_hold(done):
     assert vehicles[counts].sum().to_dict() == logs[counts].sum().to_dict()
 
 
-def test_a_long_log_is_handed_over_in_pieces(client, jobs, done, tmp_path):
-    batch = run_batch(client, jobs, tmp_path, of_piece=2)
-    table = {
-        out: pd.read_parquet(out / "windows").sort_values(["vehicle", "log", "t"], ignore_index=True)
-        for out in (done[1], tmp_path)
-    }
-    pd.testing.assert_frame_equal(table[tmp_path], table[done[1]])
-    assert len(list((tmp_path / "windows").rglob("*.parquet"))) > len(list((done[1] / "windows").rglob("*.parquet")))
-    for name in ("logs.parquet", "vehicles.parquet", "errors.parquet"):
-        assert (tmp_path / name).read_bytes() == (done[1] / name).read_bytes()
-    assert (batch.windows, batch.errors) == (done[0].windows, done[0].errors)
-    (left,) = client.run(lambda dask_worker: os.listdir(dask_worker.local_directory)).values()
-    assert left == ["storage"]  # of Dask
-
-
-class LosesWorkers:
-    """A client whose workers are gone when they are asked for what they keep."""
-
-    def __init__(self, client):
-        self.client = client
-
-    def __getattr__(self, name):
-        return getattr(self.client, name)
-
-    def run(self, function, *arguments, **options):
-        if "workers" in options:
-            raise OSError("Timed out trying to connect")
-        return self.client.run(function, *arguments, **options)
-
-
-def test_a_worker_lost_with_the_rest_of_a_log_is_an_error_of_this_run(client, jobs, done, tmp_path):
-    batch = run_batch(LosesWorkers(client), jobs, tmp_path, of_piece=2)
-    faults = [each["fault"] for each in batch.errors if "its worker was lost" in each["fault"]]
-    assert len(faults) == sum(summary["logs.all"] - summary["logs.failed"] for summary in done[0].vehicles)
-    assert not list((tmp_path / "parts").glob("*.gz"))
-    again = run_batch(client, jobs, tmp_path, of_piece=2)
-    assert (again.windows, again.errors) == (done[0].windows, done[0].errors)
-
-
 def test_a_stopped_batch_goes_on_to_the_same_bytes(client, jobs, done, tmp_path):
     def stop(what: str) -> None:
         if what.startswith("3 of"):
@@ -181,7 +140,7 @@ def test_a_stopped_batch_goes_on_to_the_same_bytes(client, jobs, done, tmp_path)
     out = tmp_path / "fleet"
     with pytest.raises(KeyboardInterrupt):
         run_batch(client, jobs, out, stop)
-    before = list((out / "parts").glob("*.gz"))
+    before = list((out / "parts").glob("*.parquet"))
     assert 0 < len(before) < 4
     run_batch(client, jobs, out)
     assert files(out) == files(done[1])
@@ -373,16 +332,6 @@ def test_a_lost_scheduler_is_one_line_and_leaves_what_is_done(in_process, config
     assert len(list((tmp_path / "out/parts").iterdir())) >= 1
 
 
-def test_a_scheduler_without_workers_is_said_once_and_so_is_their_return(in_process):
-    heard = queue.Queue()
-    with in_process() as (local, client), workers_watched(client, heard.put, every=0.05):
-        local.scale(0)
-        assert heard.get(timeout=30) is False
-        local.scale(1)
-        assert heard.get(timeout=30) is True
-    assert heard.empty()
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "line"),
     [
@@ -392,28 +341,17 @@ def test_a_scheduler_without_workers_is_said_once_and_so_is_their_return(in_proc
     ],
 )
 def test_a_scheduler_that_is_not_there_is_one_line(arguments, code, line, tractor, logs, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("soilbus.offline.batch.CONNECT_TIMEOUT", 0.3)
+    monkeypatch.setattr("soilbus.offline.cluster.CONNECT_TIMEOUT", 0.3)
     assert main(["batch", "--config", tractor, str(logs), "--out", str(tmp_path / "o"), *arguments]) == code
     (said,) = capsys.readouterr().err.splitlines()
     assert line in said
 
 
 def test_workers_of_another_version_are_one_line(client, tractor, logs, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("soilbus.offline.batch.worker_version", lambda: "0.0.9")
+    monkeypatch.setattr("soilbus.offline.cluster.worker_version", lambda: "0.0.9")
     arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address]
     assert main(["batch", "--config", tractor, str(logs), *arguments]) == 1
     assert f"workers have soilbus 0.0.9, this is {soilbus.__version__}" in capsys.readouterr().err
-
-
-def test_other_versions_of_dask_are_one_line(client, tractor, logs, tmp_path, capsys, monkeypatch):
-    versions = client.get_versions()
-    versions["scheduler"]["packages"] = versions["client"]["packages"] | {"dask": "1.0"}
-    monkeypatch.setattr("distributed.Client.get_versions", lambda *_: versions)
-    arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address, "--set", SHORT]
-    assert main(["batch", "--config", tractor, str(logs / "blue/garbage.log"), *arguments]) == 1
-    said = [line for line in capsys.readouterr().err.splitlines() if "other versions" in line]
-    assert len(said) == 1
-    assert "of dask there than here" in said[0]
 
 
 @pytest.mark.parametrize(("missing", "line"), [("soilbus", "no soilbus"), ("soilbus.offline", "another soilbus")])

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.offline.batch import cluster, jobs_of, run_batch
+from soilbus.offline.batch import jobs_of, run_batch
+from soilbus.offline.cluster import cluster, done_in_turn
 from soilbus.offline.local_workers import KilledWorker, local_workers
 
 psutil = pytest.importorskip("psutil")
@@ -97,38 +98,40 @@ def test_a_task_that_kills_its_process_takes_no_other_with_it():
     numbers = [*range(8), -1, *range(8, 16)]
     with local_workers(2) as client:
         assert sum(client.nthreads().values()) == 2
-        found = dict(client.done_in_turn(squared, ((str(n), (n,)) for n in numbers)))
+        found = dict(done_in_turn(client, squared, ((str(n), (n,)) for n in numbers)))
         assert isinstance(found.pop("-1"), KilledWorker)
         assert found == {str(n): n * n for n in range(16)}
-        assert dict(client.done_in_turn(squared, [("7", (7,))])) == {"7": 49}
+        assert dict(done_in_turn(client, squared, [("7", (7,))])) == {"7": 49}
 
 
 def test_a_process_that_is_killed_is_replaced():
     with local_workers(2) as client:
-        for process in client.run(os.getpid).values():
-            os.kill(process, signal.SIGKILL)
-        assert dict(client.done_in_turn(squared, ((str(n), (n,)) for n in range(5)))) == {
+        tasks = [(str(n), ()) for n in range(2)]
+        for _, process in done_in_turn(client, os.getpid, tasks):
+            with suppress(ProcessLookupError):  # the same process twice
+                os.kill(process, signal.SIGKILL)
+        assert dict(done_in_turn(client, squared, ((str(n), (n,)) for n in range(5)))) == {
             str(n): n * n for n in range(5)
         }
 
 
 def test_memory_is_shared_out_and_files_are_of_this_user_alone():
     with local_workers(2) as client:
-        found = dict(client.done_in_turn(swallowed, [("much", (0.75,)), ("little", (1e-3,))]))
+        found = dict(done_in_turn(client, swallowed, [("much", (0.75,)), ("little", (1e-3,))]))
         assert isinstance(found["much"], MemoryError)
         assert found["little"] > 0
-        ((folder, threads),) = set(dict(client.done_in_turn(here, [("0", (0,)), ("1", (1,))])).values())
+        ((folder, threads),) = set(dict(done_in_turn(client, here, [("0", (0,)), ("1", (1,))])).values())
         assert threads == 1
         assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
     assert not os.path.exists(folder)
 
 
 def test_processes_here_give_the_bytes_of_a_dask_cluster(client, config, logs, tmp_path):
-    """Also of logs that are handed over in pieces, and of those that fail."""
+    """Also of those that fail."""
     jobs = jobs_of(config, "t", [str(logs)], lambda _: config)
-    with cluster(None, lambda _: None, processes=2) as mine:
-        run_batch(mine, jobs, tmp_path / "mine", of_piece=2)
-    run_batch(client, jobs, tmp_path / "dask", of_piece=2)
+    with cluster(None, processes=2) as mine:
+        run_batch(mine, jobs, tmp_path / "mine")
+    run_batch(client, jobs, tmp_path / "dask")
     found = {path.relative_to(tmp_path / "mine"): path.read_bytes() for path in (tmp_path / "mine").rglob("*.*")}
     assert len(found) > 10
     assert found == {

@@ -123,8 +123,6 @@ def test_pages_show_names_as_text_and_pictures_of_before_alone_where_nothing_was
     assert not any(t.startswith(("Before", "After")) for t in left)
     assert "Missing from the model: draft_offset, grade or bulldozing</h1>" in page
     assert "Missing: something that the catalogue does not have</h1>" in plain
-    rows = [name for name in OFFSET.falls if f"<td>{name}</td>" in page]
-    assert rows == list(OFFSET.falls)
 
 
 def test_what_is_not_finite_is_null(findings):
@@ -135,7 +133,7 @@ def test_what_is_not_finite_is_null(findings):
     assert json.loads(reported, parse_constant=pytest.fail)["where"][0]["size"] is None
 
 
-def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings, page):
+def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
     soil_error = np.log(0.8) * np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
     seen = (
         Detectable(CATALOGUE["torque_lag"], 0.04, 0.04, 0.0 * soil_error),
@@ -159,7 +157,6 @@ def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings, page):
         assert line in page_of_none
     asked = json.loads(findings_json(findings))
     assert asked["could_show"] is asked["could_not_show"] is asked["unseen"] is None
-    assert "from a fall of 6 on" in page
 
 
 def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findings):

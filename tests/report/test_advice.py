@@ -146,7 +146,7 @@ def test_a_replay_says_that_no_sensor_shows_the_slope(tmp_path):
     for name, own in (("measured", config), ("level", level)):
         pipeline = Pipeline(own, load_databases(own))
         results = list(replay(pipeline, [log]))
-        steps = " ".join(sentence for sentence, _ in next_steps(results, Source(own)))
+        steps = " ".join(step.sentence for step in next_steps(results, Source(own)))
         said[name] = (summary(results, pipeline), steps)
     assert all("the ground counts as level" in text for text in said["level"])
     assert not any("the ground counts as level" in text for text in said["measured"])

@@ -196,7 +196,7 @@ def test_a_diagnosis_says_what_is_missing_by_how_much_and_what_to_do(made, findi
     for channel, unit in (("torque", "N m"), ("draft", "N"), ("sinkage", "mm")):
         pattern = rf"(Before|After): {channel} measured against modelled; typical difference [\d.]+ {unit}\."
         assert re.findall(pattern, page) == ["Before", "After"]
-    assert page.index("<details><summary>Where model and data disagreed") < page.index("reading less model")
+    assert page.index("<details><summary>All findings") < page.index("reading less model")
 
 
 def test_modelled_readings_are_those_of_the_fitted_soil_at_the_measured_loads_and_slips(findings):

@@ -374,7 +374,7 @@ def batch(args: argparse.Namespace) -> None:
     try:
         parts = args.out / "parts" if args.resume or args.retry else None
         jobs = jobs_of(config, Path(args.config or found_configuration(None)).name, args.logs, own, parts)
-        with phases("batch") as progress, cluster(args.scheduler, say) as client, results_in(args.out):
+        with phases("batch") as progress, cluster(args.scheduler) as client, results_in(args.out):
             done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose, args.retry)
     except BatchError as error:
         raise WorkError(str(error)) from None

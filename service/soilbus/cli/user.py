@@ -213,19 +213,15 @@ def watch(args: argparse.Namespace) -> None:
     from soilbus.can.bus import BusError
     from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError
-    from soilbus.report.watch import watch, watch_log
+    from soilbus.report.watch import watch
 
     if args.channel is not None:
         if args.log is not None:
             raise ConfigError([f"--channel {args.channel}: {args.log} is a recording, which has no bus"])
         args.set.append(f"bus.channel={json.dumps(args.channel)}")
     config, is_named = configured_or_reference(args), args.config is not None
-    how = is_named, args.seconds, args.plain, args.json
     try:
-        if args.log is None:
-            watch(config, *how)
-        else:
-            watch_log(config, args.log, args.speed, *how)
+        watch(config, args.log, args.speed, is_named, args.seconds, args.plain, args.json)
     except (BusError, LogError) as error:
         raise WorkError(str(error)) from None
 

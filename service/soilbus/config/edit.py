@@ -21,25 +21,11 @@ EffectTable = Mapping[str, Any]
 def with_effects_text(
     path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Sequence[str] = ()
 ) -> str:
-    """Return the text of a configuration file with overrides in force and other effects.
+    """Return the text of a configuration file with overrides KEY=VALUE in force and other [model] effects.
 
-    Parameters
-    ----------
-    path
-        The file.
-    overrides
-        KEY=VALUE.
-    effects
-        Tables of [model] effects.
-    place
-        Folder that the text will be kept in; DBC files are named so that they are found from there.
-    notes
-        Comments below the effects, in the same array: there they may stand in every form of the table.
-
-    Raises
-    ------
-    ConfigError
-        As load_config().
+    DBC files are named so that they are found from the folder `place`, in which the text will be kept. Notes are
+    comments below the effects, in the same array: there they may stand in every form of the table. ConfigError as
+    load_config().
     """
     config = load_config(path, overrides)
     document = overridden(tomlkit.parse(path.read_text(encoding="utf-8-sig")), overrides)

@@ -70,17 +70,9 @@ def machine(name: str) -> Path:
 
 
 def found_configuration(name: str | None) -> Path:
-    """Return the file that a command's --config means.
+    """Return the file that a command's --config means; ConfigError where there is none.
 
-    Parameters
-    ----------
-    name
-        A file, or else the name of a reference machine; None: `soilbus.toml` in the current folder.
-
-    Raises
-    ------
-    ConfigError
-        Where there is none.
+    The name is that of a file, or else of a reference machine; None: `soilbus.toml` in the current folder.
     """
     if name is None:
         path = Path(CONFIGURATION)

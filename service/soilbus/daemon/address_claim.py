@@ -25,20 +25,7 @@ ADDRESS_CLAIMED, REQUEST = 60928, 59904
 
 
 class AddressClaim:
-    """Claim of one source address (SAE J1939-81).
-
-    Parameters
-    ----------
-    settings
-        The section [j1939].
-    address
-        That of our frames.
-
-    Raises
-    ------
-    ConfigError
-        The extra is not installed.
-    """
+    """Claim of one source address, that of our frames (SAE J1939-81); ConfigError where the extra is not installed."""
 
     filters: tuple[dict[str, Any], ...] = tuple(
         {"can_id": group << 8, "can_mask": 0x03FF0000, "extended": True} for group in (ADDRESS_CLAIMED, REQUEST)

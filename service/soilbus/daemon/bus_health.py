@@ -25,19 +25,7 @@ _WORDS = {
 
 
 def health_frame(state: BusState, counts: BusCounts) -> tuple[str, dict[str, Any]]:
-    """Return message name and values of the frame BusHealth.
-
-    Parameters
-    ----------
-    state
-        State of the CAN controller.
-    counts
-        Events on the bus since the start.
-
-    Returns
-    -------
-    Name of the message and value by signal name.
-    """
+    """Return message name and values by signal name of the frame BusHealth."""
     return "BusHealth", {
         "BusState": str(state),
         "Reopened": counts.reopened,

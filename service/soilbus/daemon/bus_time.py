@@ -35,15 +35,7 @@ class BusTime:
         """Monotonic time at which a frame was taken last."""
 
     def set_ahead(self, stamp: float, now: float) -> bool:
-        """Return whether a stamp shows that the stamping clock was set ahead since the last frame.
-
-        Parameters
-        ----------
-        stamp
-            Bus time of a frame [s].
-        now
-            Monotonic time [s].
-        """
+        """Return whether a frame's stamp [s] shows that the stamping clock was set ahead since the last frame."""
         return self.last_frame > 0.0 and stamp - self.at(now) > CLOCK_STEP and stamp <= LAST_TIME
 
     def took(self, stamp: float, now: float) -> None:
@@ -69,15 +61,7 @@ class BusTime:
         return self.at(now) if math.isnan(stamping) else stamping
 
     def heard(self, end: float, now: float) -> float:
-        """Return the bus time [s] up to which all frames were received.
-
-        Parameters
-        ----------
-        end
-            Bus time [s] at which the next window ends; the bus is asked only near it.
-        now
-            Monotonic time [s].
-        """
+        """Return the bus time [s] up to which all frames came; the bus is asked only near a window's `end` [s]."""
         heard, latest = max(self._stamp, self.at(self._nothing_left) - CLOSE_DELAY), self.at(now) + TAKING_DELAY
         if heard < end <= latest:
             return max(heard, min(self._bus.heard_until(), latest))  # its clock may just have been set

@@ -31,12 +31,7 @@ FAILURES_TO_FAULT = 3
 class GuardedEstimator:
     """Estimator whose exceptions are caught and counted.
 
-    Parameters
-    ----------
-    first
-        Makes the estimator; called in the worker, when it is first needed.
-    again
-        Makes a new estimator without a posterior of earlier windows.
+    `first` makes it in the worker, when it is first needed; `again` makes one without a posterior of earlier windows.
     """
 
     def __init__(self, first: Callable[[], WindowEstimator], again: Callable[[], WindowEstimator]) -> None:
@@ -62,19 +57,8 @@ class GuardedEstimator:
         return self._in_a_row >= FAILURES_TO_FAULT
 
     def solve(self, task: WindowTask) -> WindowResult:
-        """Solve one window.
+        """Return a window's result without a warning of immobilisation; an invalid one where the estimator raised.
 
-        Parameters
-        ----------
-        task
-            The window.
-
-        Returns
-        -------
-        The result without a warning of immobilisation (the loop adds it); an invalid one where the estimator raised.
-
-        Notes
-        -----
         One failure leaves the tracker's state as it was, because the tracker changes only with a whole window. After
         FAILURES_TO_FAULT in a row that state may be the cause, and a new estimator takes over.
         """

@@ -22,22 +22,10 @@ class Health:
         self._sent, self._able = 0, now
 
     def fault(self, now: float, solving_since: float | None, hears: bool, sent: int) -> str | None:
-        """Return what has stopped working; call it once a tick.
+        """Return what has stopped working, for the status line; None where nothing has. Call it once a tick.
 
-        Parameters
-        ----------
-        now
-            Monotonic time [s].
-        solving_since
-            When the worker began with its present window [s]; None where it has none.
-        hears
-            Whether the bus is up with frames on it.
-        sent
-            Frames sent since the start.
-
-        Returns
-        -------
-        The fault as the status line gives it, None without one.
+        The worker began with its present window at `solving_since` [s]. `hears`: the bus is up with frames on it.
+        `sent` frames went out since the start.
         """
         if sent != self._sent or not hears:
             self._sent, self._able = sent, now

@@ -15,13 +15,7 @@ log = logging.getLogger(__name__)
 class Notifier:
     """Sender to systemd's notification socket; without one every call does nothing.
 
-    Attributes
-    ----------
-    address
-        Path of the socket, `@` first for an abstract one; None without systemd.
-    watchdog_interval
-        Period [s] at which `watchdog` should be called: half of systemd's own limit;
-        None where no watchdog is set.
+    `watchdog` should be called every `watchdog_interval` [s], half of systemd's own limit; None where none is set.
     """
 
     address: str | None = None

@@ -68,36 +68,12 @@ FOREIGN_SENDER_HOLD_TIME = 3.0
 
 
 class Service:
-    """Service of one vehicle on one bus.
+    """Service of one vehicle on one bus; `step` makes one round and returns, `run` repeats it until `stop`.
 
-    Parameters
-    ----------
-    config
-        The vehicle's configuration.
-    pipeline
-        Intake and estimator.
-    bus
-        The open bus, or one that will be opened.
-    publisher
-        Encodes our frames.
-    notifier
-        systemd's notification socket.
-    workers
-        One thread, which estimates.
-    clock
-        Monotonic time [s]; stamps of frames only space the samples.
-    on_window
-        Called with each window's result.
-    open_persistence
-        Called in the worker before the first window; returns the stored state of the last run, or None.
-    waiting
-        Waits for a future, for at most the seconds given (as WorkQueue).
-    claim
-        Of our source address; None where [j1939] asks for none.
-
-    Notes
-    -----
-    `step` makes one round and returns; `run` repeats it until `stop`.
+    The bus may open later. `workers` is one thread, which estimates; `waiting` waits for its future, for at most the
+    seconds given. Stamps of frames only space the samples, the clock [s] is monotonic. `on_window` is called with each
+    window's result, `open_persistence` in the worker before the first window: it returns the stored state of the last
+    run, or None. The claim is of our source address; None where [j1939] asks for none.
     """
 
     def __init__(
@@ -412,17 +388,10 @@ class Service:
         return None if self._reached <= self._interrupted else self.result
 
     def present_decision(self, now: float) -> Traversability:
-        """Return the present decision.
+        """Return the decision of the last window, judged at `now` [s].
 
-        Parameters
-        ----------
-        now
-            Monotonic time [s].
-
-        Returns
-        -------
-        The decision of the last window, judged at `now`; unknown while an input is stale or a fault holds, and until
-        a window has data from after the last interruption.
+        It is unknown while an input is stale or a fault holds, and until a window has data from after the last
+        interruption.
         """
         if self._interruption(now) is not None:
             return Traversability()

@@ -46,16 +46,8 @@ def start_service(
 ) -> Service:
     """Return the service of a configuration, with its bus open.
 
-    Parameters
-    ----------
-    config
-        The vehicle's configuration.
-    wait
-        Whether an interface that does not exist yet may appear later.
-    on_window
-        Called with each window's result.
-    rehearse
-        Whether the worker solves made-up windows while the first real one fills.
+    With `wait` an interface that does not exist yet may appear later. With `rehearse` the worker solves made-up windows
+    while the first real one fills.
 
     Raises
     ------

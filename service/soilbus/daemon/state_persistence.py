@@ -48,19 +48,7 @@ class StoredPrior(NamedTuple):
 
 
 class StatePersistence:
-    """Keeper of one vehicle's state in a folder.
-
-    Parameters
-    ----------
-    folder
-        Where the file is.
-    owner
-        The vehicle that the state must belong to.
-    writer
-        A thread of its own.
-    wall
-        Time of day [s, Unix].
-    """
+    """Keeper of one vehicle's state in a folder, which a thread of its own writes with the time of day [s, Unix]."""
 
     def __init__(self, folder: Path, owner: Owner, writer: Executor, wall: Callable[[], float] = time.time) -> None:
         self._path, self._owner, self._writer, self._wall = folder / FILE, owner, writer, wall
@@ -84,17 +72,7 @@ class StatePersistence:
         )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:
-        """Begin to write the state if that is due; return at once.
-
-        Parameters
-        ----------
-        now
-            Monotonic time [s].
-        gaussian
-            Posterior of this run; None as long as there is none.
-        counts
-            Gives the counters of this run.
-        """
+        """Begin to write the state of this run if that is due; return at once."""
         if now < self._next:
             return
         self._next = now + STORE_PERIOD

@@ -87,14 +87,7 @@ class _File(_Model):
 class Owner:
     """Owner of a state: a digest of all that a posterior depends on, and the bounds of such a posterior.
 
-    Attributes
-    ----------
-    key
-        Digest of configuration and signals.
-    gains
-        Names of the gain errors (G,).
-    median, std
-        Of the soil parameters (6,) and the gain errors (G,); sd 0 means held.
+    Median and std are of the soil parameters (6,) and the gain errors (G,), whose names are `gains`; sd 0 means held.
     """
 
     key: str
@@ -116,13 +109,7 @@ class Owner:
 
 
 def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussian:
-    """Return a Gaussian in the form in which it is stored.
-
-    Raises
-    ------
-    StateError
-        It could not be read back.
-    """
+    """Return a Gaussian in the form in which it is stored; StateError where it could not be read back."""
     _check(gaussian, owner)
     return StoredGaussian(
         at=at,
@@ -133,13 +120,7 @@ def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussi
 
 
 def gaussian_of(stored: StoredGaussian, owner: Owner) -> Gaussian:
-    """Return the Gaussian that was stored.
-
-    Raises
-    ------
-    StateError
-        This vehicle's estimator cannot have had it.
-    """
+    """Return the Gaussian that was stored; StateError where this vehicle's estimator cannot have had it."""
     if tuple(stored.soil) != PARAMETERS or tuple(stored.gains) != owner.gains:
         raise StateError("the Gaussian is of other parameters")
     rows = stored.covariance
@@ -194,20 +175,7 @@ def dumped(state: State, owner: Owner) -> bytes:
 
 
 def loaded(content: bytes, owner: Owner) -> State:
-    """Return the state in a file's content.
-
-    Parameters
-    ----------
-    content
-        Any bytes.
-    owner
-        The vehicle that the state must belong to.
-
-    Raises
-    ------
-    StateError
-        It cannot be used; one line says why.
-    """
+    """Return the state of this vehicle in a file's content; StateError says in one line why it cannot be used."""
     try:
         raw = json.loads(content)
     except (ValueError, RecursionError):
@@ -231,13 +199,7 @@ def loaded(content: bytes, owner: Owner) -> State:
 
 
 def read(path: Path, owner: Owner) -> State | None:
-    """Return the state in a file; None where there is no file.
-
-    Raises
-    ------
-    StateError
-        It cannot be used; one line says why.
-    """
+    """Return the state in a file; None where there is no file, StateError where it cannot be used."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
         with open(descriptor, "rb") as file:

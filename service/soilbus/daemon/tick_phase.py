@@ -20,15 +20,7 @@ MAX_PERIOD_CHANGE = 0.05 * TICK
 
 
 def next_tick(tick: float, end: float) -> float:
-    """Return when the next tick is due.
-
-    Parameters
-    ----------
-    tick
-        When the last one was due [s].
-    end
-        When a window ends [s]; nan or inf where that is not known.
-    """
+    """Return when [s] the next tick is due after the last one, by the end of a window (nan or inf: not known)."""
     if not math.isfinite(end):
         return tick + TICK
     off = math.remainder(end - LEAD_BEFORE_WINDOW_END - tick, TICK)

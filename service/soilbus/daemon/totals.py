@@ -13,19 +13,7 @@ from soilbus.can.bus import BusCounts
 def totals(
     windows: int, deadline_misses: int, failures: Mapping[str, int], bus: BusCounts, frames: Counts
 ) -> dict[str, int]:
-    """Return the counters by name.
-
-    Parameters
-    ----------
-    windows, deadline_misses
-        Windows solved; windows dropped and ticks late.
-    failures
-        Failed solves by kind.
-    bus
-        Events on the bus.
-    frames
-        Frames received and refused.
-    """
+    """Return the counters by name; deadline misses are windows dropped and ticks late."""
     refused: Counter[str] = Counter()
     for (_, reason), n in frames.refused.items():
         refused[f"refused.{reason}"] += n

@@ -32,16 +32,9 @@ SAMPLE_RATE = 50.0
 
 
 def warm_up(config: Config, database: Database, ours: Database) -> list[WindowResult]:
-    """Run a pipeline and a publisher on a modelled drive, so that the first real window is not slow.
+    """Return the windows of a modelled drive, run through pipeline and publisher to make the first real one fast.
 
-    Returns
-    -------
-    The windows' results.
-
-    Raises
-    ------
-    ValueError
-        The configuration has no vehicle, or no wheel with torque, speed and load.
+    ValueError where the configuration has no vehicle, or no wheel with torque, speed and load.
     """
     pipeline, publisher = Pipeline(config, database), Publisher(ours)
     settings, intake = config.estimator, pipeline.intake

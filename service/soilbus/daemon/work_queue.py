@@ -35,18 +35,9 @@ def wait_for(future: Future[WindowResult], longest: float) -> None:
 
 
 class WorkQueue:
-    """Queue of windows for `workers` (one thread), which solves them beside the loop.
+    """Queue of windows, which the one thread of `workers` solves beside the loop by `solve`.
 
-    Parameters
-    ----------
-    workers
-        One thread.
-    solve
-        Solves a window; called in that thread.
-    now
-        Monotonic time [s].
-    waiting
-        Waits for a future, for at most the seconds given.
+    `waiting` waits for a future, for at most the seconds given.
     """
 
     def __init__(
@@ -81,23 +72,7 @@ class WorkQueue:
         return bool(self._pending) and self._pending[0].future.done()
 
     def add(self, task: WindowTask, ended: float, epoch: int, now: float) -> int:
-        """Give the worker a window.
-
-        Parameters
-        ----------
-        task
-            The window.
-        ended
-            Monotonic time [s] of its end.
-        epoch
-            Epoch of the intake that it belongs to.
-        now
-            Monotonic time [s].
-
-        Returns
-        -------
-        Number of waiting windows that were dropped.
-        """
+        """Give the worker a window that ended at `ended` [s]; return how many waiting ones were dropped for it."""
         if not self._pending:
             self._busy_since = now
         self._pending.append(Pending(self._workers.submit(self._solve, task), ended, epoch))

@@ -16,13 +16,7 @@ UTC = 100
 
 
 def write_geopackage(path: Path, geojson: str) -> None:
-    """Write the points of a FeatureCollection as layer `soil`, in EPSG:4326.
-
-    Raises
-    ------
-    NotWritten
-        The file cannot be written.
-    """
+    """Write the points of a FeatureCollection as layer `soil`, in EPSG:4326; NotWritten."""
     from pyogrio.raw import read, write
 
     logging.getLogger("pyogrio").setLevel(logging.WARNING)  # it reports its success

@@ -52,13 +52,7 @@ LOG_SCHEMA = {
 
 
 def write_mcap(path: Path, results: Sequence[WindowResult], config: Config) -> None:
-    """Write the windows, in the order of their times.
-
-    Raises
-    ------
-    NotWritten
-        The file cannot be written.
-    """
+    """Write the windows, in the order of their times; NotWritten."""
     from mcap.writer import Writer
 
     records = [_without_unknowns(window_record(result, config)) for result in results]

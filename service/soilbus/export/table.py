@@ -27,13 +27,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_table(path: Path, results: Iterable[WindowResult], config: Config) -> None:
-    """Write the windows to a .parquet file, or to a CSV file under any other name.
-
-    Raises
-    ------
-    NotWritten
-        The file cannot be written.
-    """
+    """Write the windows to a .parquet file, or to a CSV file under any other name; NotWritten."""
     rows = [flat_record(window_record(result, config)) for result in results]
     if path.suffix == ".parquet":
         with whole_file_of_bytes(path) as binary:
@@ -58,12 +52,18 @@ def _cell(value: Any) -> Any:
     return "'" * value.startswith(FORMULA) + shown(value)
 
 
-def parquet_of(rows: Rows) -> bytes:
-    """Return the bytes of a Parquet file; what is not known is null."""
+def parquet_of(rows: Rows, columns: Iterable[str] = ()) -> bytes:
+    """Return the bytes of a Parquet file, by default of the columns that occur; what is not known is null."""
+    return parquet_of_tables([arrow_table(rows, columns)])
+
+
+def parquet_of_tables(tables: Iterable[Any]) -> bytes:
+    """Return the bytes of a Parquet file of pyarrow tables one below the other; what a table lacks is null."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     out = io.BytesIO()
-    pq.write_table(arrow_table(rows, arrow_schema(table_columns(rows))), out)
+    pq.write_table(pa.concat_tables(tables, promote_options="default"), out)
     return out.getvalue()
 
 
@@ -87,12 +87,13 @@ def arrow_schema(names: Iterable[str]) -> Any:
     return pa.schema(fields, metadata={"soilbus_version": __version__, "soilbus_schema": SCHEMA_VERSION})
 
 
-def arrow_table(rows: Rows, schema: Any) -> Any:
-    """Return a pyarrow table of rows under a schema; null where a row has no value of that name."""
+def arrow_table(rows: Rows, columns: Iterable[str] = ()) -> Any:
+    """Return a pyarrow table of rows, by default of the columns that occur; null where a row has no such value."""
     import pyarrow as pa
 
-    columns = [pa.array([_as_utf8(row.get(f.name)) for row in rows], f.type) for f in schema]
-    return pa.Table.from_arrays(columns, schema=schema)
+    schema = arrow_schema(columns or table_columns(rows))
+    arrays = [pa.array([_as_utf8(row.get(f.name)) for row in rows], f.type) for f in schema]
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def _as_utf8(value: Any) -> Any:

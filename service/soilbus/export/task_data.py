@@ -72,16 +72,10 @@ def compaction_code(result: WindowResult, bounds: Sequence[float]) -> int:
 
 
 def write_task_data(folder: Path, results: Iterable[WindowResult], config: Config) -> int:
-    """Write the files of all windows with a position into a folder, which is made if need be.
+    """Write the files of all windows with a position into a folder, which is made if need be; NotWritten.
 
-    Returns
-    -------
-    The number of windows left out: without a position, or of a time before 1980, which a time log cannot hold.
-
-    Raises
-    ------
-    NotWritten
-        A file cannot be written.
+    It returns the number of windows left out: without a position, or of a time before 1980, which a time log cannot
+    hold.
     """
     every = list(results)
     first, last = EPOCH.timestamp(), LAST_DAY.timestamp()

@@ -59,10 +59,7 @@ class TableError(LogError):
 def read_columns(path: Path, needed: Sequence[str] | None) -> Columns:
     """Return the cells of the needed columns of a CSV or Parquet file; of all columns by default.
 
-    Raises
-    ------
-    TableError
-        The file cannot be read, or a column is missing.
+    TableError where it cannot be read, or a column is missing.
     """
     readers = {".csv": _csv, ".parquet": _parquet, ".pq": _parquet}
     reader = _csv if str(path) == "-" else readers.get(kind_of(path))
@@ -97,28 +94,21 @@ def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
     """Rows of a file with cells, and what separates these."""
     try:
         with opened(path) as stream:
-            lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
-            first = next((line for line in lines if line.strip()), "")
-            separator = separator_of(first, needed)
-            rows = csv.reader(chain([first], lines), delimiter=separator, strict=True)
-            return [row for row in rows if row], separator
+            return csv_rows(stream, needed)
     except (ValueError, csv.Error) as error:
         raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
 
 
+def csv_rows(stream: Any, names: Collection[str]) -> tuple[list[list[str]], str]:
+    """Return the rows of a stream's text that have cells, and the separator of these (see `separator_of`)."""
+    lines = text_lines(plain_bytes(BytesIO(read_all(stream))))
+    first = next((line for line in lines if line.strip()), "")
+    separator = separator_of(first, names)
+    return [row for row in csv.reader(chain([first], lines), delimiter=separator, strict=True) if row], separator
+
+
 def separator_of(header: str, names: Collection[str]) -> str:
-    """Return the separator of a table's cells.
-
-    Parameters
-    ----------
-    header
-        Its first line.
-    names
-        Of columns that are looked for.
-
-    Returns
-    -------
-    The one of SEPARATORS by which most of the names are columns, of several the most frequent one.
+    """Return the separator by which most of the names are columns under this header, of several the most frequent one.
 
     Examples
     --------
@@ -127,8 +117,8 @@ def separator_of(header: str, names: Collection[str]) -> str:
     """
 
     def found(separator: str) -> tuple[int, int]:
-        cells = {cell.strip() for row in csv.reader([header], delimiter=separator) for cell in row}
-        return len(cells & set(names)), header.count(separator)
+        cells = {cell.strip().lower() for row in csv.reader([header], delimiter=separator) for cell in row}
+        return len(cells & {name.lower() for name in names}), header.count(separator)
 
     return max(SEPARATORS, key=found)
 
@@ -208,14 +198,8 @@ class Samples(NamedTuple):
 class SignalTable:
     """A table of decoded signals, read once as the frames of its columns' messages; it stands where a Log stands.
 
-    Parameters
-    ----------
-    path
-        CSV, Parquet or MF4, packed or not; "-" is CSV from standard input.
-    time
-        Its column of times.
-    names
-        The columns, in the order of their identifiers.
+    It is CSV, Parquet or MF4, packed or not, with a column of times; "-" is CSV from standard input. The names of
+    columns are in the order of their identifiers.
     """
 
     note, left_out = "", 0
@@ -238,10 +222,7 @@ class SignalTable:
     def frames(self) -> Iterator[Frame]:
         """Yield a frame for each cell that is not empty; text gives infinity, which is refused and counted.
 
-        Raises
-        ------
-        TableError
-            The table cannot be read, or a column is missing or has no number.
+        TableError where the table cannot be read, or a column is missing or has no number.
         """
         series = read_samples(self.path, self._time, self._names)
         for name, samples in series.items():
@@ -274,10 +255,7 @@ def signal_table(config: Config, path: Path) -> SignalTable:
 def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = None) -> dict[str, Samples]:
     """Return the samples of a table by column; of all columns with numbers by default.
 
-    Raises
-    ------
-    TableError
-        The table cannot be read, a column is missing, or the column of times holds none.
+    TableError where it cannot be read, a column is missing, or the column of times holds none.
     """
     if kind_of(path) == ".mf4":
         return _mf4(path, names)

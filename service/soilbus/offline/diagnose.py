@@ -31,20 +31,10 @@ __all__ = ["Findings", "diagnose_logs"]
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """Diagnosis with the recordings that it was made from.
+    """Diagnosis with the recordings and the configuration that it was made from.
 
-    Attributes
-    ----------
-    diagnosis
-        Result of diagnosis/diagnose.py.
-    recordings
-        The records, with samples used and refused.
-    config
-        The configuration that it holds for.
-    seconds
-        Time [s] that the diagnosis took, without reading.
-    plan
-        What to drive next where the diagnosis is ambiguous; None where no drive would help.
+    `seconds` is the time that it took, without reading. The plan says what to drive next where it is ambiguous; it is
+    None where no drive would help.
     """
 
     diagnosis: Diagnosis
@@ -88,16 +78,7 @@ def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Con
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
-    """Read logs and diagnose them together.
-
-    Parameters
-    ----------
-    config
-        The vehicle's configuration; with [table] `logs` are tables.
-    logs
-        Files.
-    say
-        Called with the name of each phase.
+    """Read logs, or with [table] tables, and diagnose them together; `say` is called with the name of each phase.
 
     Raises
     ------

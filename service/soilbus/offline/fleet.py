@@ -16,7 +16,7 @@ from soilbus.diagnosis.diagnose import NotFitted
 from soilbus.diagnosis.fleet import FALSE_DISCOVERY_RATE, Onset, diagnose_vehicle, named
 from soilbus.diagnosis.records import Record, TooLittle
 from soilbus.estimation.assembly import possible_effects, prior_of
-from soilbus.offline.parts import Job, check_version, local_log, unpacked
+from soilbus.offline.parts import Job, local_log, unpacked
 from soilbus.offline.recordings import recordings_of
 from soilbus.offline.replay import LogError
 from soilbus.pipeline.outputs import values_std
@@ -35,22 +35,8 @@ def chosen(jobs: Sequence[Job]) -> list[Job]:
     return [jobs[i] for i in np.linspace(0, len(jobs) - 1, MAX_LOGS).round().astype(int)]
 
 
-def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
-    """Diagnose the logs of one vehicle together; `fault` says what cannot be diagnosed.
-
-    Parameters
-    ----------
-    jobs
-        Logs of one vehicle with one configuration, in the order of their dates.
-    version
-        Of the soilbus that asks for it.
-
-    Raises
-    ------
-    OtherVersion
-        This soilbus is of another version.
-    """
-    check_version(version)
+def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
+    """Diagnose the logs of one vehicle, in the order of their dates; `fault` says what cannot be diagnosed."""
     config, database = unpacked(jobs[0].setup.content)
     record = no_findings(jobs[0].vehicle, "no log of it can be diagnosed")
     if database is None:
@@ -110,16 +96,9 @@ def no_findings(vehicle: str, fault: str) -> dict[str, Any]:
 
 
 def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the fleet's diagnosis.
+    """Return the fleet's diagnosis from the findings of each vehicle with its configuration.
 
-    Parameters
-    ----------
-    findings
-        Of each vehicle, with its configuration.
-
-    Returns
-    -------
-    These, `named` with each effect, and for each effect the share of vehicles that are expected to have it.
+    It has these, `named` with each effect, and for each effect the share of vehicles that are expected to have it.
     """
     effects = [effect for each in findings for effect in each["effects"]]
     for effect, given in zip(effects, named([effect["probability"] for effect in effects]), strict=True):

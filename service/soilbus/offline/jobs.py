@@ -5,7 +5,6 @@ LOG...  ->  rows of a manifest, or one row that names LOG itself  ->  logs of ea
 
 from __future__ import annotations
 
-import csv
 import glob
 import math
 import os
@@ -21,10 +20,11 @@ from typing import Any, BinaryIO
 
 from soilbus.can.log_formats import is_csv_of_frames
 from soilbus.config.model import Config
-from soilbus.files import opened, plain_bytes, read_all, text_lines
+from soilbus.files import opened, plain_bytes, read_all
 from soilbus.offline import dataset
-from soilbus.offline.columns import MISSING_CELLS, check_cells, separator_of
-from soilbus.offline.parts import Job, Setup, file_name, place_of, setup_of, summary_of_part
+from soilbus.offline.cluster import BatchError
+from soilbus.offline.columns import MISSING_CELLS, check_cells, csv_rows
+from soilbus.offline.parts import Job, Setup, file_name, kept_of, place_of, setup_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
@@ -36,31 +36,15 @@ TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
 
 
-class BatchError(Exception):
-    """Error of a batch that cannot be done to its end; the text is one line."""
-
-
 def jobs_of(
     config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config], parts: Path | None = None
 ) -> list[Job]:
-    """Return the jobs that the arguments of the command stand for, in the order of vehicle and log.
+    """Return a job for each log that the arguments of the command stand for, in the order of vehicle and log.
 
-    Parameters
-    ----------
-    config, name
-        The configuration for logs that have none of their own, and its file's name.
-    logs
-        Logs, folders, globs, URLs, or manifests: tables (CSV, Parquet) with a column `log`, and optionally `vehicle`,
-        `configuration` and `start` (ISO 8601, or seconds since 1970).
-    load
-        Reads another configuration.
-    parts
-        Folder of parts to go on with: a log that was read before in a folder that is named here, and that is no longer
-        there, keeps its job.
-
-    Returns
-    -------
-    One job for each log.  Where no manifest names the vehicle, it is that of the folder in which the log lies.
+    An argument is a log, a folder, a glob, a URL, or a manifest: a table (CSV, Parquet) with a column `log`, and
+    optionally `vehicle`, `configuration`, which `load` reads, and `start` (ISO 8601, or seconds since 1970). Without a
+    vehicle there it is that of the folder in which the log lies. A log that was read before in a folder that is named
+    here, of which `parts` holds the windows and that is no longer there, keeps its job.
 
     Raises
     ------
@@ -106,8 +90,10 @@ def _job(entry: Mapping[str, str], argument: str, setup: Setup, log: str) -> Job
 
 def _logs_of_parts(parts: Path | None) -> dict[str, str]:
     """Logs of which there are parts, by digest."""
-    paths = [] if parts is None else sorted(parts.glob("*.gz"))
-    return {path.stem: summary["log"] for path in paths if (summary := summary_of_part(path)) is not None}
+    if parts is None:
+        return {}
+    all_kept = {path.stem: kept_of(parts, path.stem) for path in sorted(parts.glob("*.parquet"))}
+    return {digest: kept.summary["log"] for digest, kept in all_kept.items() if kept and kept.summary}
 
 
 def _lies_in(log: str, place: str) -> bool:
@@ -192,14 +178,11 @@ def _is_machine(configuration: Path) -> bool:
 
 
 def _csv_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
-    """Names of columns, and the rows of a manifest that are not empty with their lines' numbers."""
-    text = text_lines(plain_bytes(BytesIO(read_all(file))))
-    first = next(text, "")
-    table = csv.reader(chain([first], text), delimiter=separator_of(first.lower(), MANIFEST_COLUMNS), strict=True)
-    header = [name.strip().lower() for name in next(table, [])]
-    if "log" not in header:
-        return header, []
-    return header, [(table.line_num, dict(zip(header, row, strict=False))) for row in table if any(map(str.strip, row))]
+    """Names of columns, and the rows of a manifest that are not empty with their numbers."""
+    rows, _ = csv_rows(file, MANIFEST_COLUMNS)
+    header = [name.strip().lower() for name in (rows or [[]])[0]]
+    numbered = ((n, row) for n, row in enumerate(rows[1:], 2) if any(map(str.strip, row)))
+    return header, [(n, dict(zip(header, row, strict=False))) for n, row in numbered]
 
 
 def _parquet_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:

@@ -108,17 +108,9 @@ def _manoeuvre(chosen: Mapping[str, Pattern]) -> Manoeuvre:
 class Plan:
     """The manoeuvre, and between which names it decides.
 
-    Attributes
-    ----------
-    manoeuvre, between
-        What to drive, and the rivals' names.
-    separations
-        S by the name that is true and by its rival.
-    expected_probability
-        That of the right name after one such drive, whichever it is.
-    repeats
-        How often it must be driven until the right name stands alone, as S grows with the time; None for more than
-        MAX_REPEATS.
+    `separations` holds S by the name that is true and by its rival, `expected_probability` that of the right name after
+    one such drive, whichever it is. After `repeats` drives, as S grows with the time, the right name stands alone; None
+    for more than MAX_REPEATS.
     """
 
     manoeuvre: Manoeuvre
@@ -139,14 +131,9 @@ class Plan:
 
 
 def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
-    """Return the manoeuvre that best tells the rivals of a diagnosis apart; None where there are none.
+    """Return the manoeuvre that best tells the rivals of a diagnosis apart.
 
-    Parameters
-    ----------
-    diagnosis
-        The diagnosis.
-    config
-        Its vehicle; None for one that the simulator cannot drive.
+    None where there are none, and for a vehicle that the simulator cannot drive.
     """
     if len(diagnosis.rivals) < 2 or config.vehicle is None:
         return None
@@ -183,12 +170,7 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
 def what_excites(config: Config, soil: Soil) -> tuple[Manoeuvre, Posterior] | None:
     """Return the manoeuvre that determines a soil best, and its expected posterior.
 
-    Parameters
-    ----------
-    config
-        The vehicle, with its prior; None for one that the simulator cannot drive.
-    soil
-        The best guess.
+    None for a vehicle that the simulator cannot drive.
     """
     if config.vehicle is None:
         return None
@@ -268,13 +250,7 @@ def _beyond_motors(recording: Recording, config: Config) -> bool:
 
 
 def record_of_recording(name: str, recording: Recording, config: Config) -> Record:
-    """Return a simulated recording in the form that the diagnosis takes.
-
-    Raises
-    ------
-    TooLittle
-        It has not enough usable instants.
-    """
+    """Return a simulated recording in the form that the diagnosis takes; TooLittle without enough usable instants."""
     rig, settings = rig_of(config), config.estimator
     store = Bins(rig, settings.bin, 0.0)
     columns = {name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels}

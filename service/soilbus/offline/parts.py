@@ -1,34 +1,30 @@
-"""One log of a batch -> its part: all of its windows and a summary, whole or not at all.
+"""One log of a batch -> its part: a Parquet file of all of its windows, and a summary.
 
-    log -> replay -> part = gzip(summary) + pieces, each gzip(a line of JSON for each of 5000 windows)
+    log -> replay -> rows -> columns of 2000 windows -> one table -> Parquet
 
 A part depends on the log, the configuration and the version of soilbus alone: the same log gives the same bytes on
-every machine.  The replay yields one window at a time and its line goes to a temporary file; of a part no more than a
-piece is in memory, here or where it is asked for.  So memory does not grow with the log.
+every machine.
 """
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 import json
 import math
 import os
 import pickle
 import stat
-import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import lru_cache
-from io import SEEK_END, BytesIO
-from itertools import chain, islice, pairwise
+from io import SEEK_END
 from pathlib import Path
-from shutil import copyfileobj
-from tempfile import NamedTemporaryFile, TemporaryDirectory, TemporaryFile, gettempdir
-from typing import IO, Any
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from cantools.database.can import Database
 
@@ -38,7 +34,8 @@ from soilbus.config.file import located
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
-from soilbus.files import opened, plain_bytes, text_lines
+from soilbus.export.table import arrow_table, parquet_of_tables
+from soilbus.files import LIMITS, read_bounded
 from soilbus.offline.replay import LogError, OtherBus, log_names, replay
 from soilbus.offline.tables import replay_tables
 from soilbus.pipeline.outputs import flat_record, window_record
@@ -52,23 +49,18 @@ CPU_FREE = 600.0
 CPU_PER_BYTE = 300.0 / 2**20
 """Processor time [s] that it may take beside for each byte.  A drive on a full bus took 1.2 s a MiB as candump text,
 7 s a MiB packed by xz; five frames a second with data that repeat, packed by xz, took 1500 s a MiB: 7 kB for 40 min."""
-WINDOWS_OF_PIECE = 5_000
-"""Windows of a log that are handed over at once; 1 kB each.  Of messages of 10 MB Dask warns; a log of an hour, with
-a window every second, is one piece."""
+ROW_GROUP = 2000
+"""Windows that are converted at once: 2 MB of columns."""
+NO_DAY = "unknown"
+"""Day of windows whose log has no dates."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
     """A configuration with its databases, as it travels to a worker.
 
-    Attributes
-    ----------
-    name
-        File that it came from.
-    content
-        Pickled Config and Database (None for tables of a test rig).
-    digest
-        Of the settings and the DBC files.
+    The content is pickled: Config and Database (None for tables of a test rig). The digest is of settings and DBC
+    files.
     """
 
     name: str
@@ -78,22 +70,10 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A log to replay.
+    """A log to replay: absolute path or URL, the vehicle that recorded it, and this one's configuration.
 
-    Attributes
-    ----------
-    log
-        Absolute path, or URL that fsspec opens.
-    vehicle
-        That recorded it.
-    setup
-        Configuration of the vehicle.
-    start
-        Time [s] of the first sample, for logs whose stamps are no dates; None: stamps count as they are.
-    content
-        The log itself, where workers do not see the file.
-    not_sent
-        Why it was not sent along, in one line, where workers do not see the file.
+    `start` is the time [s] of the first sample, for logs whose stamps are no dates. Where workers do not see the file,
+    `content` is the log itself, or `not_sent` says in one line why it was not sent along.
     """
 
     log: str
@@ -111,64 +91,23 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
-    """Part that a worker keeps until it is asked for: its address, the file, sizes of the pieces [bytes]."""
-
-    worker: str
-    path: str
-    sizes: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of a log.
+    """Result of a log: why it was not read, or not to its end, in one line; summary and Parquet file of its windows.
 
-    Attributes
-    ----------
-    part
-        Its summary and first piece; None where there is none.
-    fault
-        Why the log was not read, or not to its end, in one line; None where it was.
-    windows
-        Windows of the part.
-    other_bus
-        Whether no frame of the log is in the DBC.
-    lasting
-        Whether the fault is of what is in the log, so that the same file has it again; else of the place or machine.
-    cpu_seconds, log_bytes
-        Cost: processor time, size of the log.
-    rest
-        The other pieces; None where there are no others.
+    `other_bus`: no frame of it is in the DBC. `lasting`: the fault is of what is in the log, so that the same file has
+    it again; else of the place or machine. `size` is that of the log in bytes.
     """
 
-    part: bytes | None
     fault: str | None
-    windows: int = 0
+    summary: dict[str, Any] | None = None
+    part: bytes = b""
     other_bus: bool = False
     lasting: bool = False
-    cpu_seconds: float = 0.0
-    log_bytes: int = 0
-    rest: Rest | None = None
-
-
-class OtherVersion(Exception):
-    """Error of a worker with another version of soilbus than the command."""
-
-
-def check_version(version: str) -> None:
-    """Raise OtherVersion where the soilbus that asks is of another version than this one."""
-    if version != __version__:
-        raise OtherVersion(f"a worker has soilbus {__version__}, this is {version}: install the same everywhere")
+    size: int = 0
 
 
 def setup_of(config: Config, name: str) -> Setup:
-    """Return the setup of a configuration.
-
-    Raises
-    ------
-    ConfigError
-        A DBC file is missing or does not fit the configuration.
-    """
+    """Return the setup of a configuration; ConfigError where a DBC file is missing or does not fit."""
     digest = hashlib.sha256((config.model_dump_json() + (config.log_channel or "")).encode())
     database = None
     if config.table is None:
@@ -235,44 +174,25 @@ def unpacked(content: bytes) -> tuple[Config, Database | None]:
     return config, database
 
 
-def part_of(job: Job, version: str, of_piece: int = WINDOWS_OF_PIECE) -> Outcome:
-    """Replay one log; a fault of the log is in the outcome.
-
-    Parameters
-    ----------
-    job
-        The log.
-    version
-        Of the soilbus that asks for it.
-    of_piece
-        Windows of a piece: no more are in memory at once.
-
-    Raises
-    ------
-    OtherVersion
-        This soilbus is of another version.
-    """
-    check_version(version)
-    begin, size = time.thread_time(), 0
+def part_of(job: Job) -> Outcome:
+    """Replay one log; a fault of the log is in the outcome."""
+    size = 0
     try:
         with local_log(job) as path:
             _check_is_file(path)
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
-            with TemporaryFile() as lines:
-                outcome = _replayed(lines, job, path, of_piece, begin + CPU_FREE + CPU_PER_BYTE * size)
+            outcome = _replayed(job, path, time.thread_time() + CPU_FREE + CPU_PER_BYTE * size)
     except LogError as error:
-        return Outcome(None, str(error))
+        return Outcome(str(error))
     except MemoryError:
-        return Outcome(None, f"{job.log}: not enough memory")
+        return Outcome(f"{job.log}: not enough memory")
     except OSError as error:
         why = MISSING if isinstance(error, FileNotFoundError) else error.strerror or one_line(error, 200)
-        return Outcome(None, f"{job.log}: {why}")
+        return Outcome(f"{job.log}: {why}")
     except Exception as error:  # a defect of ours, or of a library on a file that it never met
-        return Outcome(
-            None, f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True, log_bytes=size
-        )
-    return replace(outcome, cpu_seconds=time.thread_time() - begin, log_bytes=size)
+        return Outcome(f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True, size=size)
+    return replace(outcome, size=size)
 
 
 def _check_is_file(path: Path) -> None:
@@ -288,10 +208,7 @@ def _check_is_file(path: Path) -> None:
 def local_log(job: Job) -> Iterator[Path]:
     """Give the path of the log on this machine, for as long as the context lasts.
 
-    Raises
-    ------
-    LogError
-        The URL cannot be read, or the log is neither here nor was it sent along.
+    LogError where the URL cannot be read, or the log is neither here nor was it sent along.
     """
     if job.content is None and "://" not in job.log:
         if job.not_sent is not None and not Path(job.log).exists():
@@ -307,75 +224,33 @@ def local_log(job: Job) -> Iterator[Path]:
         yield path
 
 
-def _replayed(lines: IO[bytes], job: Job, path: Path, of_piece: int, latest: float) -> Outcome:
-    """The outcome; `lines` is an empty file that holds the pieces until the summary, which goes before, is known.
-
-    When the thread's clock says `latest` [s] the log is given up.
-    """
+def _replayed(job: Job, path: Path, latest: float) -> Outcome:
+    """The outcome; when the thread's clock says `latest` [s] the log is given up."""
     config, database = unpacked(job.setup.content)
-    summary = _Summary(job, config)
-    fault: LogError | None = None
+    summary, fault = _Summary(job, config), None
     pipeline = None if database is None else Pipeline(config, database)
-
     (label,) = log_names([path])
-
-    def written() -> Iterator[bytes]:
-        nonlocal fault
-        try:
-            for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
-                run = (result.log or "").removeprefix(label) if pipeline is None else ""  # of a table: its soil bed
-                if time.thread_time() > latest:
-                    raise LogError(f"{path}: given up: it takes more processor time than a log of its size may")
-                row = summary.row(replace(result, log=job.log + run))
-                yield json.dumps(row, allow_nan=False).encode() + b"\n"
-        except LogError as error:
-            fault = error
-
-    windows, ends = written(), [0]
-    while (first := next(windows, None)) is not None:
-        with gzip.GzipFile(filename="", fileobj=lines, mode="wb", mtime=0) as piece:
-            piece.writelines(chain([first], islice(windows, of_piece - 1)))
-        ends.append(lines.tell())
+    tables: list[Any] = []
+    rows: list[dict[str, Any]] = []
+    try:
+        for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
+            run = (result.log or "").removeprefix(label) if pipeline is None else ""  # of a table: its soil bed
+            if time.thread_time() > latest:
+                raise LogError(f"{path}: given up: it takes more processor time than a log of its size may")
+            rows.append(summary.row(replace(result, log=job.log + run)))
+            if len(rows) == ROW_GROUP:
+                tables.append(arrow_table(rows))
+                rows.clear()
+    except LogError as error:
+        fault = error
     text = None if fault is None else str(fault).replace(str(path), job.log)
-    if fault is not None and not summary.windows:
-        return Outcome(None, text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting)
-    if not summary.windows:
-        text = f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window"
-        return Outcome(None, text, lasting=True)
-    sizes = tuple(end - begin for begin, end in pairwise(ends))
-    record = {**summary.record(pipeline, text), "pieces": sizes}
-    lines.seek(0)
-    part = gzip.compress(json.dumps(record, allow_nan=False).encode() + b"\n", mtime=0) + lines.read(sizes[0])
-    rest = _left_here(lines, sizes[1:]) if sizes[1:] else None
-    return Outcome(part, text, summary.windows, lasting=fault is not None, rest=rest)
-
-
-def _left_here(lines: IO[bytes], sizes: tuple[int, ...]) -> Rest:
-    """The rest of a file, in the folder of the worker that this runs on; it goes with the worker."""
-    address, folder = _worker()
-    with NamedTemporaryFile(dir=folder, delete=False) as file:
-        copyfileobj(lines, file)
-    return Rest(address, file.name, sizes)
-
-
-def _worker() -> tuple[str, str]:
-    """Address and folder of the Dask worker that this runs on; of a process of a batch here its temporary folder."""
-    if (distributed := sys.modules.get("distributed")) is not None:
-        with suppress(ValueError):  # no worker
-            worker = distributed.get_worker()
-            return worker.address, worker.local_directory
-    return "", gettempdir()
-
-
-def piece_left(path: str, begin: int, size: int) -> bytes:
-    """Return a piece of a part that was left on a worker; with the last one its file goes."""
-    with open(path, "rb") as file:
-        file.seek(begin)
-        piece = file.read(size)
-        is_last = file.tell() == file.seek(0, SEEK_END)
-    if is_last:
-        os.unlink(path)
-    return piece
+    if summary.windows:
+        part = parquet_of_tables([*tables, arrow_table(rows)])
+        return Outcome(text, summary.record(pipeline, text), part, lasting=fault is not None)
+    if fault is not None:
+        return Outcome(text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting)
+    window = config.estimator.window
+    return Outcome(f"{job.log}: no recording in it lasts the {window:g} s of a window", lasting=True)
 
 
 class _Summary:
@@ -385,7 +260,6 @@ class _Summary:
         self.job, self.config = job, config
         self.windows = 0
         self._shift: float | None = None
-        self._columns: dict[str, None] = {}
         self._counts: Counter[str] = Counter()
         self._bearing_sum, self._bearing_n = 0.0, 0
         self._rejected: Counter[str] = Counter()
@@ -398,8 +272,8 @@ class _Summary:
         record = flat_record(window_record(result, self.config))
         longitude, latitude = (None, None) if result.position is None else map(math.degrees, reversed(result.position))
         when = self._time(result.t)
-        row = {"vehicle": self.job.vehicle, "time": when, "longitude": longitude, "latitude": latitude} | record
-        self._columns.update(dict.fromkeys(row))
+        day = NO_DAY if when is None else datetime.fromtimestamp(when / 1e3, UTC).date().isoformat()
+        place = {"vehicle": self.job.vehicle, "day": day, "time": when, "longitude": longitude, "latitude": latitude}
         self.windows += 1
         settings = self.config.estimator
         follows = 0.0 < result.t - self._newest < 1.5 * settings.hop
@@ -414,7 +288,7 @@ class _Summary:
             self._rejected += Counter(result.rejected)
         if when is not None:  # the clock may be set back
             self._times = [min([when, *self._times[:1]]), max([when, *self._times[1:]])]
-        return row
+        return place | record
 
     def _time(self, t: float) -> int | None:
         """Milliseconds since 1970; None where the stamp is no date."""
@@ -424,7 +298,7 @@ class _Summary:
         return round(t * 1e3) if is_date(t) else None
 
     def record(self, pipeline: Pipeline | None, fault: str | None) -> dict[str, Any]:
-        """The whole log in one row, with the names of its windows' columns."""
+        """The whole log in one row."""
         frames: dict[str, int | None] = {}
         used, rejected = None, self._rejected
         if pipeline is not None:
@@ -451,38 +325,38 @@ class _Summary:
             "samples": used,
             **{f"rejected.{reason}": n for reason, n in sorted(rejected.items())},
             "fault": fault,
-            "columns": list(self._columns),
         }
 
 
-def summary_of_part(path: Path) -> dict[str, Any] | None:
-    """Return the summary in a part; None where there is no part."""
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What came of a log, as in an Outcome, with the bytes of its part and the state of its file.
+
+    Of the log it has the size and, where that is known, the time of change [ns].
+    """
+
+    fault: str | None
+    summary: dict[str, Any] | None
+    part_bytes: int
+    other_bus: bool
+    size: int
+    changed: int | None
+
+    def is_of(self, size: int | None, changed: int | None) -> bool:
+        """Return whether a file in this state is still the same, as far as its state is known."""
+        return size in (self.size, None) and (changed == self.changed or None in (changed, self.changed))
+
+
+def part_path(parts: Path, digest: str) -> Path:
+    """Return where the windows of a log are."""
+    return parts / f"{digest}.parquet"
+
+
+def kept_of(parts: Path, digest: str) -> Kept | None:
+    """Return what is kept of a log; None where it is not whole."""
     try:
-        with opened(path) as part:
-            summary: dict[str, Any] = json.loads(next(text_lines(part)))
-        is_whole = path.stat().st_size > sum(summary["pieces"])
-    except (OSError, EOFError, StopIteration, ValueError, KeyError):
+        kept = Kept(**json.loads(read_bounded(parts / f"{digest}.json", LIMITS.whole)))
+        is_whole = not kept.part_bytes or part_path(parts, digest).stat().st_size == kept.part_bytes
+    except (OSError, ValueError, TypeError):
         return None
-    summary["columns"] = _shared(tuple(summary["columns"]))
-    return summary if is_whole else None
-
-
-@lru_cache(maxsize=256)
-def _shared(columns: tuple[str, ...]) -> tuple[str, ...]:
-    """The same columns as one object: a fleet's summaries are in memory at once, and most have the same."""
-    return columns
-
-
-def pieces_of_part(path: Path, sizes: Sequence[int]) -> Iterator[bytes]:
-    """Yield the windows of a part, as pieces of the sizes that its summary says."""
-    with path.open("rb") as file:
-        file.seek(-sum(sizes), SEEK_END)
-        for size in sizes:
-            yield file.read(size)
-
-
-def rows_of_piece(piece: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
-    """Yield the windows of a piece as rows of a table, `at_once` or fewer at a time."""
-    lines = text_lines(plain_bytes(BytesIO(piece)))
-    while rows := [json.loads(line) for line in islice(lines, at_once)]:
-        yield rows
+    return kept if is_whole else None

@@ -55,18 +55,9 @@ class InlineExecutor(Executor):
 
 
 class PlayedBus:
-    """Bus that carries the frames of a recording that pass the filters, and keeps what is sent.
+    """Bus that carries the frames of a recording that pass the filters of python-can, and keeps what is sent.
 
-    Parameters
-    ----------
-    frames
-        In the order of the recording.
-    filters
-        As for python-can, of the messages that the service would hear.
-    clock
-        Goes on with the frames.
-    channel
-        Name of the channel of what is sent.
+    The clock goes on with the frames; what is sent has the name of the channel.
     """
 
     def __init__(

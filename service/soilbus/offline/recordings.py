@@ -28,20 +28,9 @@ from soilbus.pipeline.intake import Intake
 
 @dataclass(frozen=True, slots=True)
 class Recordings:
-    """Logs of one vehicle.
+    """Logs of one vehicle: a record for each usable part, and the index of the first one of each log.
 
-    Attributes
-    ----------
-    records
-        One for each usable part of a log.
-    first
-        Index of the first record of each log.
-    samples
-        Samples in them.
-    rejected
-        Refused samples by reason.
-    too_short
-        Names of the parts that were left out.
+    With them stand the samples in them, refused samples by reason, and names of the parts that were too short to use.
     """
 
     records: tuple[Record, ...]
@@ -59,20 +48,10 @@ def recordings_of(
     longest: float = math.inf,
     partial: bool = False,
 ) -> Recordings:
-    """Read logs as recordings of one vehicle.
+    """Read logs as recordings of one vehicle, no more than `longest` [s] of each.
 
-    Parameters
-    ----------
-    config, database
-        The vehicle.
-    logs
-        Files.
-    progress
-        Called with the number of frames read and the time in the recording [s].
-    longest
-        Time [s] at the beginning of each log after which no more of it is read.
-    partial
-        Whether what lies before the damage of a log counts.
+    With `partial` what lies before the damage of a log counts. `progress` is called with the number of frames read and
+    the time in the recording [s].
 
     Raises
     ------
@@ -109,14 +88,9 @@ def recordings_of(
 
 
 def check_different(logs: Sequence[Path]) -> None:
-    """Refuse a recording that is given twice, as one file or as a copy.
+    """Refuse a recording that is given twice, as one file or as a copy, with a LogError.
 
     Files that differ in size are not read.
-
-    Raises
-    ------
-    LogError
-        Two logs are the same file or have the same bytes, or one of two of the same size cannot be read.
     """
     known = [(log, log.stat()) for log in logs if os.path.exists(log)]
     _check_unlike((log, (status.st_dev, status.st_ino)) for log, status in known)
@@ -152,10 +126,7 @@ def parts(
 ) -> Iterator[Window]:
     """Yield the windows of a log, one for each stretch without a set clock or a long silence.
 
-    Raises
-    ------
-    LogError
-        The log cannot be read to its end; with `partial` only where nothing of it can.
+    LogError where the log cannot be read to its end; with `partial` only where nothing of it can.
     """
     whole: list[Window] = []
 

@@ -74,24 +74,12 @@ def replay(
     workers: Executor | None = None,
     on_fault: Callable[[LogError], None] | None = None,
 ) -> Iterator[WindowResult]:
-    """Yield the result of every window of the logs.
+    """Yield the result of every window of the logs, one after the other, each with the name of its `log`.
 
-    Parameters
-    ----------
-    pipeline
-        Intake and estimator; it counts frames and refusals of all logs.
-    logs
-        Files, replayed one after the other.
-    progress
-        Called now and then with the number of frames read and the time in the recording [s].
-    workers
-        Executor of `estimator_beside`: reading and estimating then overlap, with the same results.
-    on_fault
-        Called with the error of a log that is damaged or of another bus; the next log follows.
-
-    Yields
-    ------
-    Results in order, each named by the `log` of its results; window numbers go on from log to log.
+    The pipeline counts frames and refusals of all logs, and numbers their windows on. With `workers`, an executor of
+    `estimator_beside`, reading and estimating overlap, with the same results. `progress` is called now and then with
+    the number of frames read and the time in the recording [s]; `on_fault` with the error of a log that is damaged or
+    of another bus, after which the next log follows.
 
     Raises
     ------
@@ -159,16 +147,7 @@ def _windows(intake: Intake, log: Path, progress: Callable[[int, float], None] |
 
 
 def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
-    """Feed the frames of a log to an intake.
-
-    Parameters
-    ----------
-    intake
-        Takes the frames.
-    log
-        The file.
-    progress
-        Called with the number of frames read and the time in the recording [s].
+    """Feed the frames of a log to an intake, and say how far it is.
 
     Yields
     ------

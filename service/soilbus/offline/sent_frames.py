@@ -31,23 +31,10 @@ __all__ = ["sent_beside", "sent_frames"]
 
 
 def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
-    """Yield what the service sends while each log is on its bus; it begins again with each log.
+    """Yield the frames that the service sends while each log is on its bus, stamped with the recording's time [s].
 
-    Parameters
-    ----------
-    config
-        The vehicle's configuration.
-    logs
-        Recordings, one after the other; one that is damaged ends where it is.
-
-    Yields
-    ------
-    Frames of output.dbc, stamped with the time of the recording [s].
-
-    Raises
-    ------
-    ConfigError
-        The configuration cannot work, or a frame would come less often than its DBC says.
+    It begins again with each log; one that is damaged ends where it is. ConfigError where the configuration cannot
+    work, or a frame would come less often than its DBC says.
     """
     for log in logs:
         yield from sent_beside(config, _readable(config, log))

@@ -55,22 +55,11 @@ class Run:
 
 
 def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
-    """Return the runs of a CSV or Parquet file, in the order of their first rows.
+    """Return the runs of a CSV or Parquet file, one for each soil bed, in the order of their first rows.
 
-    Parameters
-    ----------
-    config
-        Its [table] maps the columns.
-    path
-        The file.
-    name
-        What its runs are called by, with the soil bed where [table] run is given; by default the file's name.
-
-    Returns
-    -------
-    One run for each soil bed. A cell that is empty or says nan, NA or null is missing; a row without load or slip is
-    left out and counted. Cells of CSV are separated by commas, semicolons or tabs; beside the latter two numbers may
-    have decimal commas.
+    A cell that is empty or says nan, NA or null is missing; a row without load or slip is left out and counted. Cells
+    of CSV are separated by commas, semicolons or tabs; beside the latter two numbers may have decimal commas. Runs are
+    called by `name`, by default the file's, with the soil bed where [table] run is given.
 
     Raises
     ------
@@ -83,14 +72,7 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
 def runs_of_columns(config: Config, columns: Columns, source: str) -> list[Run]:
     """Return the runs of columns in memory, as runs_of(); None is missing, too.
 
-    Parameters
-    ----------
-    config
-        Its [table] maps the columns.
-    columns
-        Cells (N,) of each column by its name.
-    source
-        What messages and the only run are called by.
+    Messages and the only run are called by `source`.
     """
     check_columns(source, list(columns), _needed(_table_of(config, source)))
     return _runs(config, columns, source, source)
@@ -213,18 +195,9 @@ def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Ru
 
 
 def window_of_rows(rig: Rig, t: Array, values: Mapping[str, Array], rim_speed: float = 1.0) -> Window:
-    """Return a window of rows.
+    """Return a window of rows of one wheel at times [s] (N,), with quantities (N,) in SI by the roles of a table.
 
-    Parameters
-    ----------
-    rig
-        One wheel.
-    t
-        Times [s] (N,).
-    values
-        Quantities (N,) in SI by the roles of a table; nan is missing.
-    rim_speed
-        Rim speed of the stand-in [m/s], exact; the ground speed gets the slip's variance.
+    nan is missing. The stand-in's rim speed [m/s] is exact; the ground speed gets the slip's variance.
     """
     wheel, slip, noise = rig.wheels[0], values["slip"], rig.noise["ground_speed"]
     samples = {

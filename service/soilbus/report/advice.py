@@ -18,19 +18,7 @@ DIAGNOSE = "record it and run soilbus diagnose"
 
 
 def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str | None:
-    """Return one line on windows of one status and reason.
-
-    Parameters
-    ----------
-    windows
-        Windows that all have this status and reason.
-    valid
-        The valid windows of the same run, to compare with.
-
-    Returns
-    -------
-    The line; None where nothing is to be done.
-    """
+    """Return one line on windows of one status and reason beside the valid ones of the run; None without advice."""
     kind, *names = windows[0].reason.split()
     what = ", ".join(names)
     match kind:

@@ -32,11 +32,6 @@ def batch_text(batch: Batch, out: Path) -> str:
         text += text_of([f"  {error['fault']}{kept}"])
     if len(batch.errors) > MAX_FAULTS:
         text += f"  and {len(batch.errors) - MAX_FAULTS} more in {shown(out / 'errors.parquet')}\n"
-    if batch.duration:
-        hours = batch.duration / 3600.0
-        text += (
-            f"cost of an hour of log: {batch.cpu_seconds / hours:.0f} CPU s, {batch.log_bytes / hours / 1e6:.1f} MB\n"
-        )
     if batch.stale_diagnosis:
         text += "diagnosis.json and effects.parquet of an earlier run are removed; --diagnose writes them again\n"
     return text + (fleet_text(batch.fleet) if batch.fleet else "")

@@ -35,13 +35,7 @@ from soilbus.words import shown, text_of
 
 
 def configuration_report(config: Config) -> str:
-    """Return the whole report of `soilbus check`.
-
-    Raises
-    ------
-    ConfigError
-        With one line for each fault.
-    """
+    """Return the whole report of `soilbus check`; ConfigError with one line for each fault."""
     effects_and_parameters_of(config)
     if config.table is not None:
         columns = [(role, c.column, f"{c.factor:g}") for role, c in config.table.columns.items()]
@@ -358,12 +352,7 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
 
 
 def identifiable(config: Config) -> list[tuple[str, str]]:
-    """Return which sensors determine each soil parameter, or why none does.
-
-    Returns
-    -------
-    Pairs of parameter name and verdict.
-    """
+    """Return each soil parameter with the sensors that determine it, or why none does."""
     rig = rig_of(config)
     held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
     if config.table is not None:

@@ -49,7 +49,6 @@ MOVING_ADVICE = "Lift, add no torque"
 HELD = "Go slowly, caution is held"
 ABOVE_BEST = "Keep going, slip above best"
 GONE_ADVICE = "Rely on your own judgement"
-FIRST_IS_DUE = "the first window is due"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
     "go": ("#000000", "#00d700"),
@@ -85,7 +84,7 @@ CARRYING_SLIP = 0.6
 
 
 class Verdict(NamedTuple):
-    """Verdict in a word for block letters, in a sentence, what to do, and the kind of its colours."""
+    """Verdict in a word, in a sentence, what to do, and the kind of its colours."""
 
     word: str
     said: str
@@ -98,29 +97,13 @@ class Verdict(NamedTuple):
         foreground, background = COLOURS[self.kind]
         return Style(color=background, bgcolor=foreground, reverse=True, bold=True)
 
-    @property
-    def block_style(self) -> Style:
-        """Colours of a full block, also behind it, as fonts leave gaps between blocks."""
-        foreground, _ = COLOURS[self.kind]
-        return Style(color=foreground, bgcolor=foreground, reverse=True)
-
 
 @dataclass(frozen=True)
 class Vehicle:
     """Names and limits that a configuration adds to the frames.
 
-    Attributes
-    ----------
-    wheels
-        Names in the order of the frames; empty where no configuration names them.
-    axles
-        Of each of these wheels `Front`, or `Rear` behind the first axle, as in the names of signals.
-    window
-        Length of an estimation window [s].
-    max_slip
-        Slip at the end of the slip bar.
-    go
-        Probability from which the state is go, once enough windows say so.
+    Wheels are named in the order of the frames, or not at all; axles are `Front` or `Rear` as in the names of signals.
+    A window is `window` [s] long, the slip bar ends at `max_slip`, and the state is go from the probability `go` on.
     """
 
     wheels: tuple[str, ...] = ()
@@ -157,16 +140,7 @@ class Slip(NamedTuple):
 class Dashboard:
     """Received frames and their last minute, as the dashboard shows them.
 
-    Attributes
-    ----------
-    known
-        The received frames.
-    vehicle
-        What the configuration adds to them.
-    fault
-        Why the bus is away; empty while it is there.
-    span
-        Time [s] that the charts show.
+    `fault` says why the bus is away; it is empty while it is there. Charts show the last `span` seconds.
     """
 
     known: ReceivedFrames
@@ -175,8 +149,6 @@ class Dashboard:
     span: float = 60.0
     _samples: deque[tuple[float, dict[str, float]]] = field(default_factory=deque, repr=False)
     _began: float = math.nan
-    _inputs_since: float | None = None
-    _saw_them_begin: bool = False
 
     def __post_init__(self) -> None:
         self._began = self.known.now
@@ -184,7 +156,6 @@ class Dashboard:
     def sample(self) -> None:
         """Take the present values into the history; call it for each frame and each picture."""
         now, known = self.known.now, self.known
-        self._watch_for_inputs()
         if self._samples and 0.0 <= now - self._samples[-1][0] < SAMPLE_PERIOD:
             return
         values = {
@@ -265,15 +236,13 @@ class Dashboard:
         if known.is_unproven:
             return f"waiting for {IN_A_ROW} frames in a row", MEASURING
         reason = str(known.value("SoilbusStatus", "Reason"))
-        left = self.until_first_window()
-        if left is not None and reason in ("none", "None", "not_excited", "model_gap"):
-            return left, MEASURING
-        if left is not None and left != FIRST_IS_DUE and reason == "input_missing":
-            return f"starting, {left}", MEASURING
         if known.value("SoilbusStatus", "State") is None:
             return "no status of soilbus", MEASURING
         if known.value("SoilbusStatus", "State") == "starting":
             return "soilbus is starting", MEASURING
+        has_no_window = known.number("SoilbusStatus", "Window") is None
+        if has_no_window and reason in ("none", "None", "not_excited", "model_gap"):
+            return f"the first window takes {self.vehicle.window:g} s", MEASURING
         if (
             reason not in REASONS
             and not known.is_stale("PresentDemand")
@@ -289,29 +258,6 @@ class Dashboard:
         if known.value("SoilbusStatus", "State") == "estimating":
             return "the next window is due", MEASURING
         return "the estimate is too old", MEASURING
-
-    def _watch_for_inputs(self) -> None:
-        """Since when the service has had inputs, as a first window needs `window` seconds of them."""
-        state, reason, window = (self.known.value("SoilbusStatus", name) for name in ("State", "Reason", "Window"))
-        if state is None:
-            return
-        if window is not None or state in ("starting", "waiting") or reason in ("no_frames", "bus_down"):
-            self._inputs_since, self._saw_them_begin = None, True
-            return
-        uptime = self.known.number("SoilbusIdentity", "Uptime")
-        has_begun = uptime is not None and uptime < 2.0
-        if self._inputs_since is None or has_begun:
-            self._saw_them_begin |= has_begun
-            self._inputs_since = self.known.now - (uptime if uptime is not None and has_begun else 0.0)
-
-    def until_first_window(self) -> str | None:
-        """Return how long until the first window has ended; None once there was one, or without inputs."""
-        if self._inputs_since is None or self.known.number("SoilbusStatus", "Window") is not None:
-            return None
-        left = math.ceil(self.vehicle.window - (self.known.now - self._inputs_since))
-        if left <= 0:
-            return FIRST_IS_DUE
-        return f"{'' if self._saw_them_begin else 'at most '}{left} s until the first window"
 
     def slip(self) -> Slip:
         """Return the slip and set-points of the wheel that slips most; unknown axle: the smaller set-points of both."""

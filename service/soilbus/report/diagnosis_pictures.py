@@ -25,8 +25,6 @@ FEW_POINTS = 100
 """Readings of a wheel up to which their dots are large."""
 BINS = 10
 """Equally filled bins of a picture's means."""
-PLOT_RANGE_SD = 5.0
-"""Standard deviations that a picture of standardised residuals shows."""
 POINTS_SHOWN = 99.5
 """Per cent of the differences that a picture's range holds."""
 MARKERS = "o^sDvP*X"
@@ -266,37 +264,3 @@ def _draw_drafts(
     axis.set_xlabel("draft, kN")
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
-
-
-def residual_picture(fitted: FittedModel, title: str) -> Picture:
-    """Return the standardised residuals by channel (rows) over slip, load and time (columns)."""
-    channels = grouped(fitted.held_out_series(), lambda series: series.channel)
-    return picture(
-        lambda figure: _draw_residuals(figure, channels, title),
-        0.6 + 2.2 * len(channels),
-        f"residuals {title}",
-        10.0,
-        100,
-    )
-
-
-def _draw_residuals(figure: Any, channels: Mapping[str, Sequence[Series]], title: str) -> None:
-    figure.suptitle(title)
-    names = ("slip", "load", "since")
-    axes = figure.subplots(len(channels), len(names), sharey=True, sharex="col", squeeze=False)
-    for row, (channel, of_wheels) in zip(axes, channels.items(), strict=True):
-        for one in of_wheels:
-            step = max(len(one.since) // MAX_POINTS, 1)
-            for axis, name in zip(row, names, strict=True):
-                x, z = getattr(one, name) / REGRESSORS[name].si, one.standardised
-                colour = axis.plot(x[::step], z[::step], ".", ms=2, alpha=0.3)[0].get_color()
-                means = np.array([(x[part].mean(), z[part].mean()) for part in _bins(x)])
-                axis.plot(*means.T, "-", color=colour, label=one.wheel)
-        for axis in row:
-            axis.axhline(0.0, color="grey", lw=0.5)
-        row[0].set_ylabel(f"{channel}, σ")
-        row[0].set_ylim(-PLOT_RANGE_SD, PLOT_RANGE_SD)
-        if len(of_wheels) > 1:
-            row[-1].legend(ncols=4, fontsize="x-small")
-    for axis, name in zip(axes[-1], names, strict=True):
-        axis.set_xlabel(f"{REGRESSOR_NAMES[name]}, {REGRESSORS[name].unit}")

@@ -1,4 +1,4 @@
-"""The driver's page: state in block letters, what to do, slip beside the best slip, draft beside the possible draft.
+"""The driver's page: state over a third of it, what to do, slip beside the best slip, draft beside the possible draft.
 
 It fills a terminal of any size; where there is too little room for charts the page is a few lines of text.
 """
@@ -9,7 +9,6 @@ import textwrap
 
 from rich.text import Text
 
-from soilbus.report.block_letters import in_cells, in_half_cells
 from soilbus.report.dashboard import Dashboard, Verdict, force, percent
 from soilbus.report.text_charts import area, bar, place
 
@@ -26,9 +25,9 @@ def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
         return small_page(dashboard, width, height)
     verdict = dashboard.verdict()
     lines = band(verdict, width, height // 3)
+    lines.append(Text(verdict.todo.center(width).rstrip(), style="bold"))
     is_roomy = height > LEAST_HEIGHT + 4
     lines += [Text()] if is_roomy else []
-    lines += _todo(verdict.todo, width, height // 10)
     lines += _slip(dashboard, width, max(height // 16, 1))
     lines += [Text()] if is_roomy else []
     lines += _draft(dashboard, width, height - len(lines) - 1)
@@ -46,17 +45,11 @@ def small_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
 
 
 def band(verdict: Verdict, width: int, height: int) -> list[Text]:
-    """Return the verdict over the whole width: block letters, and under them the sentence."""
-    letters = in_cells(verdict.word, width - 2, height - 2) or [verdict.word]
-    above = (height - 1 - len(letters)) // 2
-    rows = ["", *[""] * (above - 1), *letters] if above else letters
-    rows += [""] * (height - 1 - len(rows)) + [textwrap.shorten(verdict.said, width, placeholder="…")]
-    block = max(map(len, letters))
-    centred = (row.ljust(block).center(width) if row in letters else row.center(width) for row in rows)
-    lines = [Text(row, style=verdict.style) for row in centred]
-    for line in lines:
-        line.highlight_regex("█+", verdict.block_style)
-    return lines
+    """Return the verdict over the whole width: its word in the middle, and in the last line the sentence."""
+    rows = [""] * height
+    rows[height // 2 - 1] = " ".join(verdict.word)
+    rows[-1] = textwrap.shorten(verdict.said, width, placeholder="…")
+    return [Text(row.center(width), style=verdict.style) for row in rows]
 
 
 def footer(dashboard: Dashboard, width: int) -> Text:
@@ -64,21 +57,6 @@ def footer(dashboard: Dashboard, width: int) -> Text:
     said = f"bus away: {dashboard.fault}" if dashboard.fault else dashboard.freshness()
     said = textwrap.shorten(said, width - len(KEYS) - 2, placeholder="…")
     return Text(f"{said:<{width - len(KEYS)}}{KEYS}")
-
-
-def _todo(todo: str, width: int, height: int) -> list[Text]:
-    """What to do as large as fits into `height` rows, in three rows at least, in two lines of them if need be."""
-    letters = in_cells(todo, width - 2, height) or in_half_cells(todo, width - 2)
-    lines = [letters] if letters else [in_half_cells(half, width - 2) or [half] for half in _halves(todo)]
-    rows = [row for line in lines for row in line]
-    return [Text(row.center(width).rstrip(), style="bold") for row in rows]
-
-
-def _halves(sentence: str) -> tuple[str, str]:
-    """The sentence in two lines of nearly equal length."""
-    words = sentence.split()
-    halves = ((" ".join(words[:i]), " ".join(words[i:])) for i in range(1, len(words)))
-    return min(halves, key=lambda pair: max(map(len, pair)))
 
 
 def _slip(dashboard: Dashboard, width: int, height: int) -> list[Text]:

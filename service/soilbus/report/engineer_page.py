@@ -120,7 +120,7 @@ def _head(dashboard: Dashboard, width: int) -> Text:
 
 def _kind(known: ReceivedFrames) -> Iterator[str]:
     yield from _said(known, "SoilClass", "Kind", "soil: {}")
-    yield from _measured(known, "SoilClass", "Probability", "({:.2f})")
+    yield from _said(known, "SoilClass", "Probability", "({:.2f})")
 
 
 def _forecast(known: ReceivedFrames) -> Iterator[str]:
@@ -131,7 +131,7 @@ def _forecast(known: ReceivedFrames) -> Iterator[str]:
     slip = known.number("DemandForecast", "Slip")
     if slip is not None:
         yield f"slip to come {percent(slip)}"
-    yield from _measured(known, "DemandForecast", "Sinkage", "sinkage to come {:.0f} mm")
+    yield from _said(known, "DemandForecast", "Sinkage", "sinkage to come {:.0f} mm")
 
 
 def _soil(dashboard: Dashboard) -> list[Text]:
@@ -190,12 +190,12 @@ def _gap(dashboard: Dashboard) -> list[Text]:
 def _refused(dashboard: Dashboard) -> list[Text]:
     """Samples refused by the service, and frames of ours that we refused ourselves."""
     known = dashboard.known
-    share = "".join(_measured(known, "SoilbusStatus", "RejectedShare", "{:.1f} % of samples")) or "-"
+    share = "".join(_said(known, "SoilbusStatus", "RejectedShare", "{:.1f} % of samples")) or "-"
     count, reason = known.number("WindowQuality", "Rejected"), known.value("WindowQuality", "RejectedReason")
     window = "-" if count is None else f"{count:.0f}"
     if count and isinstance(reason, str):
         window += f", most {reason}"
-    missed = "".join(_measured(known, "SoilbusStatus", "DeadlineMisses", "{:.0f}")) or "-"
+    missed = "".join(_said(known, "SoilbusStatus", "DeadlineMisses", "{:.0f}")) or "-"
     rows: list[Row] = [
         ("inputs", share),
         ("in window", window),
@@ -211,7 +211,7 @@ def _service(dashboard: Dashboard) -> list[Text]:
     state = "  ".join((*_said(known, "SoilbusStatus", "State", "{}"), *_said(known, "SoilbusStatus", "Reason", "({})")))
     version = [known.number("SoilbusIdentity", f"Version{part}") for part in ("Major", "Minor", "Patch")]
     shown = "-" if None in version else ".".join(f"{part:.0f}" for part in version)
-    shown += "".join(_measured(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s"))
+    shown += "".join(_said(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s"))
     bus = "".join(_said(known, "BusHealth", "BusState", "{}")) or "-"
     counts = ((what, known.number("BusHealth", signal)) for signal, what in FAULTS_OF_BUS.items())
     faults = [f"{what} {count:.0f}" for what, count in counts if count]
@@ -256,16 +256,9 @@ def _chart(dashboard: Dashboard, name: str, width: int, height: int) -> list[str
 
 
 def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
-    """A named value in words, nothing where it is not known."""
+    """A value in words, nothing where it is not known."""
     value = known.value(message, signal)
     if value is not None and value != "none":
-        yield form.format(value)
-
-
-def _measured(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
-    """A number in words, nothing where it is not known."""
-    value = known.number(message, signal)
-    if value is not None:
         yield form.format(value)
 
 

@@ -56,31 +56,17 @@ class Picture(NamedTuple):
     png: str
 
 
-class Table(NamedTuple):
-    """A table of plain texts; `numbers` are the columns to be aligned to the right."""
+class Step(NamedTuple):
+    """What to do next: a sentence, a command that does it or nothing, and more lines."""
 
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    numbers: frozenset[int] = frozenset()
+    sentence: str
+    command: str = ""
+    lines: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Recordings and configuration of a report.
-
-    Attributes
-    ----------
-    config
-        The vehicle and the settings.
-    file
-        The configuration's file; None for one that is in no file.
-    overrides
-        KEY=VALUE that were in force over it.
-    logs
-        The recordings.
-    made
-        When.
-    """
+    """Recordings and configuration of a report: the configuration's file, if any, and KEY=VALUE in force over it."""
 
     config: Config
     file: Path | None = None
@@ -141,17 +127,7 @@ def _wheel_text(wheel: Wheel) -> str:
 
 
 def page(template: str, source: Source, **content: Any) -> str:
-    """Return one page of HTML.
-
-    Parameters
-    ----------
-    template
-        A file of the folder `templates`; it escapes every text.
-    source
-        What the page was made from, for its foot.
-    content
-        What the template asks for.
-    """
+    """Return one page of HTML from a file of `templates`, which escapes every text; the source is for its foot."""
     return _environment().get_template(template).render(source=source, **content) + "\n"
 
 
@@ -173,18 +149,9 @@ def _printable(value: Any) -> Any:
 
 
 def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH, dpi: int = DPI) -> Picture:
-    """Return a picture for a page.
+    """Return a picture for a page: `draw` draws into an empty matplotlib figure, `words` say what it shows.
 
-    Parameters
-    ----------
-    draw
-        Draws into an empty matplotlib figure.
-    height, width
-        [inch].
-    words
-        What it shows.
-    dpi
-        Pixels per inch.
+    Height and width are in inches, `dpi` is pixels for each.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -157,20 +157,10 @@ def _open_values(value: Any) -> int:
 def proposal(
     database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str, time: str = ""
 ) -> Proposal:
-    """Return a configuration proposed from matched signals.
+    """Return a configuration proposed from matched signals and from what a recording says, if there is one.
 
-    Parameters
-    ----------
-    database
-        The vehicle's messages.
-    assignment, facts
-        Signals by slot, and what a recording says; `Facts()` without one.
-    files
-        DBC files as the configuration shall name them; none for a table of signals over time.
-    origin
-        The command, for the first line.
-    time
-        Column of the times of a table; "" where it has its own.
+    DBC files are named as the configuration shall name them; there are none for a table of signals over time, whose
+    column of times is `time`. `origin` is the command, for the first line.
     """
     draft = _Draft(database, _one_layout(assignment), facts)
     draft.note(

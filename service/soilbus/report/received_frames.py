@@ -84,15 +84,7 @@ class _Stream:
 
 
 class ReceivedFrames:
-    """The last good frame of each message of a database.
-
-    Parameters
-    ----------
-    database
-        Our output DBC.
-    clock
-        Monotonic time [s].
-    """
+    """The last good frame of each message of our output DBC, by a monotonic clock [s]."""
 
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
         self._messages = {(m.frame_id, m.is_extended_frame): m for m in database.messages}

@@ -26,12 +26,7 @@ COUNTS = {
 def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
     """Return what the received frames say as nested dicts (keys: docs/json.md).
 
-    Parameters
-    ----------
-    dashboard
-        Received frames, and the names of the wheels.
-    t
-        Time [s] of the newest frame; None before the first.
+    t: time [s] of the newest frame; None before the first.
     """
     received, wheels = dashboard.known, dashboard.wheels()
     number, value = received.number, received.value

@@ -10,16 +10,14 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
-from soilbus.grouping import grouped
-from soilbus.pipeline.result import WindowResult, is_date
+from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
 from soilbus.report.configuration import NO_SLOPE, shows_no_slope
-from soilbus.report.page import Picture, Source, Table, page
+from soilbus.report.page import Picture, Source, Step, page
 from soilbus.report.replay_pictures import (
     STATES,
     clock_text,
     curve_pictures,
-    dates,
     decision_picture,
     map_pictures,
     run_pictures,
@@ -28,31 +26,24 @@ from soilbus.report.windows import by_reason, machine_line, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
-    """Return the whole page of a replay.
-
-    Parameters
-    ----------
-    results
-        Every window.
-    text
-        Their summary.
-    source
-        Configuration and logs.
-    """
-    config = source.config
-    shown = list(_pictures(results, config))
+    """Return the whole page of a replay, with the text of its summary."""
+    shown = list(_pictures(results, source.config))
+    curves = (
+        "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate; its band is"
+        " 95 % wide."
+    )
     return page(
         "replay.html",
         source,
-        headline=headline(results, config),
-        sentences=list(sentences(results)),
+        command="replay",
+        headline=headline(results, source.config),
+        paragraphs=[" ".join(sentences(results))],
         pair=shown[:2],
-        pictures=shown[2:],
-        logs=_by_log(results),
+        sections=[("Soil and wheels", curves, shown[2:])],
         steps=list(next_steps(results, source)),
-        config=config,
-        windows=_windows(results),
-        summary=text,
+        config=source.config,
+        details="Counts of windows, samples and refusals",
+        text=text,
     )
 
 
@@ -117,70 +108,22 @@ def _range(values: Sequence[float] | Array, unit: str) -> str:
     return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
 
 
-def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tuple[str, str]]:
-    """Yield what to do about windows of no or little use, and what to map: a sentence, and a command or nothing."""
+def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[Step]:
+    """Yield what to do about windows of no or little use, and what to map."""
     config = source.config
     good = [r for r in results if r.status is Status.VALID]
     for (status, reason), group in by_reason(results):
         what = advice(group, good)
         if what is not None:
             why = reason.removeprefix(f"{status} ").replace("_", " ")
-            yield f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.", ""
+            yield Step(f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.")
     if any(r.reason.split()[0] in ("model_mismatch", "no_convergence") for r in results):
-        yield "Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html"
+        yield Step("Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html")
     if config.table is not None:
         return
     if shows_no_slope(config):
-        yield f"{NO_SLOPE[0].upper()}{NO_SLOPE[1:]}.", ""
+        yield Step(f"{NO_SLOPE[0].upper()}{NO_SLOPE[1:]}.")
     if config.signals.latitude is None:
-        yield "For a map of the route, map a position: signals.latitude and signals.longitude.", ""
+        yield Step("For a map of the route, map a position: signals.latitude and signals.longitude.")
     if not any(wheel.sinkage is not None for wheel in config.wheel):
-        yield "A sinkage sensor (wheel.sinkage) narrows the error bars of the soil; none is mapped.", ""
-
-
-def _by_log(results: Sequence[WindowResult]) -> Table | None:
-    """A row for each of several logs."""
-    logs = grouped(results, lambda r: r.log or "-")
-    if len(logs) < 2:
-        return None
-    rows = []
-    for log, of in logs.items():
-        used = [r for r in of if r.status is Status.VALID]
-        bearing = [r.bearing.value / 1e3 for r in used if r.bearing]
-        draft = [d.value / 1e3 for r in used if (d := r.traversability.max_draft)]
-        go = sum(r.traversability.state is State.GO for r in of)
-        rows.append((
-            log, f"{dates(of)} {clock_text(of[0].t)}".strip(), str(len(of)), str(len(used)), str(go),
-            f"{np.median(bearing):.3g}" if bearing else "-", f"{np.median(draft):.2g}" if draft else "-",
-        ))  # fmt: skip
-    head = ("log", "first window ends", "windows", "valid", "GO", "bearing pressure, kPa", "largest draft, kN")
-    return Table(head, rows, frozenset(range(2, 7)))
-
-
-def _windows(results: Sequence[WindowResult]) -> Table:
-    rows = [
-        (
-            r.log or "-",
-            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_date(r.t) else f"{r.t:.1f}",
-            str(r.status) + ("" if r.reason == "none" else f" ({r.reason})"),
-            "-" if r.bearing is None else f"{r.bearing.value / 1e3:.2f} ± {r.bearing.std / 1e3:.2f}",
-            "-" if r.traversability.max_draft is None else f"{r.traversability.max_draft.value / 1e3:.2f}",
-            "-" if r.chi2 is None else f"{r.chi2:.2f}",
-            "-" if r.termination is None else f"{r.termination} ({r.iterations})",
-            str(r.traversability.state),
-            ", ".join(f"{k} {v}" for k, v in r.rejected.items()) or "-",
-        )
-        for r in results
-    ]
-    head = (
-        "log",
-        "end",
-        "estimate",
-        "bearing pressure, kPa",
-        "largest draft, kN",
-        "chi²",
-        "solver ended by (evaluations)",
-        "may go on",
-        "refused samples",
-    )
-    return Table(head, rows)
+        yield Step("A sinkage sensor (wheel.sinkage) narrows the error bars of the soil; none is mapped.")

@@ -27,9 +27,7 @@ from soilbus.terra.earth import offset
 
 SPACE_BETWEEN = 0.03
 """Space between two recordings in a picture, as a share of the time of all."""
-TICK_STEPS = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 21600, 43200, 86400)
-"""Distances [s] of ticks that are easy to read on a clock."""
-MAX_TICKS = 5
+TICKS = 5
 """Ticks of a time axis: as many clock times as fit side by side."""
 LABELLED_SHARE = 0.13
 """Share of a ribbon's length from which a segment has its name in it."""
@@ -85,15 +83,7 @@ def dates(results: Sequence[WindowResult]) -> str:
 
 
 class TimeAxis:
-    """Time axis with recordings one after the other.
-
-    Parameters
-    ----------
-    results
-        Every window, at least one.
-    hop
-        [s], for which a window's decision stands.
-    """
+    """Time axis with recordings one after the other; a window's decision stands for `hop` [s]."""
 
     def __init__(self, results: Sequence[WindowResult], hop: float) -> None:
         self.parts = stretches(results)
@@ -129,44 +119,16 @@ class TimeAxis:
 
     def dress(self, axis: Any) -> None:
         """Draw ticks with clock times, and a rule between recordings."""
-        step = next((s for s in TICK_STEPS if self.length / s <= MAX_TICKS), TICK_STEPS[-1])
         day = dates(self._results)
-        places, labels = self._ticks(step)
-        labels = labels if day else [label.removesuffix(" s") for label in labels]
+        places = np.linspace(0.0, self.end, TICKS)
+        begins = [part[0].t - self.hop + shift for part, shift in zip(self.parts, self.shift, strict=True)]
+        of_part = np.maximum(np.searchsorted(begins, places, "right") - 1, 0)
+        stamps = [x - self.shift[i] for x, i in zip(places, of_part, strict=True)]
         axis.set_xlim(0.0, 1.01 * self.end)
-        axis.set_xticks(places, labels)
-        for shift, part in list(zip(self.shift, self.parts, strict=True))[1:]:
-            axis.axvline(part[0].t - self.hop + shift - SPACE_BETWEEN * self.length / 2.0, color="0.4", lw=0.8, ls=":")
+        axis.set_xticks(places, [clock_text(round(t)).removesuffix(" s") for t in stamps])
+        for begin in begins[1:]:
+            axis.axvline(begin - SPACE_BETWEEN * self.length / 2.0, color="0.4", lw=0.8, ls=":")
         axis.set_xlabel(f"UTC, {day}" if day else "time of the log, s")
-
-    def _ticks(self, step: float) -> tuple[list[float], list[str]]:
-        form = "%H:%M" if step % 60 == 0 else "%H:%M:%S"
-        places: list[float] = []
-        labels: list[str] = []
-        for part, shift in zip(self.parts, self.shift, strict=True):
-            first, last = part[0].t - self.hop, part[-1].t
-            times = np.arange(math.ceil(first / step) * step, last + 1e-6, step).tolist() or [first]
-            for t in times:
-                if not places or t + shift - places[-1] >= 0.8 * self.end / (MAX_TICKS + 1):
-                    places.append(t + shift)
-                    labels.append(clock_text(t, form))
-        return places, labels
-
-    def name_recordings(self, axis: Any) -> None:
-        """Write the name of each of several recordings above its begin, as far as there is room."""
-        if len({part[0].log for part in self.parts}) < 2:
-            return
-        last = None
-        for shift, part in zip(self.shift, self.parts, strict=True):
-            share = (part[-1].t - part[0].t + self.hop) / self.end
-            if part[0].log != last and part[0].log:
-                room = max(int(share * 62), 4)
-                name = part[0].log if len(part[0].log) <= room else part[0].log[: room - 1] + "…"
-                place = (part[0].t - self.hop + shift, 1.0)
-                axis.annotate(
-                    name, place, (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=9
-                )
-            last = part[0].log
 
 
 def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture:
@@ -198,7 +160,6 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
             axis.text(0.5, 0.5, "no draft is known", ha="center", va="center", transform=axis.transAxes)
             axis.set_yticks([])
         time.dress(axis)
-        time.name_recordings(state)
         _legend(figure, [look for look in (*STATES.values(), *STATUSES.values()) if look in unnamed])
 
     words = "over time: may the tractor go on, quality of the estimate, draft pulled and largest possible draft"
@@ -262,21 +223,11 @@ def _draw_runs(
 
 
 def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
-    """Yield the caption and picture of the route, by decision and by largest draft; none without positions."""
+    """Yield the caption and picture of the route by decision; none without positions."""
     placed = [r for r in results if r.position is not None]
-    if len(placed) < 2:
-        return
-    yield (
-        "The route by decision.",
-        picture(lambda figure: _draw_map(figure, placed, _by_state), 4.0, "map of the route, coloured by decision"),
-    )
-    if any(r.traversability.max_draft for r in of_use(placed)):
-        yield (
-            "The route by the largest possible draft.",
-            picture(
-                lambda figure: _draw_map(figure, placed, _by_draft), 4.0, "map of the route, coloured by largest draft"
-            ),
-        )
+    if len(placed) > 1:
+        words = "map of the route, coloured by decision"
+        yield "The route by decision.", picture(lambda figure: _draw_map(figure, placed), 4.0, words)
 
 
 def _begun(part: Sequence[WindowResult]) -> list[float]:
@@ -297,7 +248,6 @@ def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None], wo
         draw_curve(axis)
         axis.set_ylabel(label)
         time.dress(axis)
-        time.name_recordings(ribbon)
 
     return picture(draw, 3.2, f"{words} over time")
 
@@ -366,9 +316,7 @@ def _draw_wheels(axis: Any, time: TimeAxis, wheels: Sequence[str], quantity: str
     axis.legend(ncols=4, loc="best")
 
 
-def _draw_map(
-    figure: Any, placed: Sequence[WindowResult], draw_points: Callable[[Any, Any, Sequence[WindowResult], Array], None]
-) -> None:
+def _draw_map(figure: Any, placed: Sequence[WindowResult]) -> None:
     axis = figure.subplots()
     latitude, longitude = np.array([r.position for r in placed]).T
     first = float(latitude[0]), float(longitude[0])
@@ -378,7 +326,14 @@ def _draw_map(
         members = slice(begin, begin + len(part))
         axis.plot(east[members], north[members], "-", color="0.6", lw=0.8, zorder=1)
         begin += len(part)
-    draw_points(figure, axis, placed, np.column_stack([east, north]))
+    at = np.column_stack([east, north])
+    for state, look in STATES.items():
+        here = at[[r.traversability.state is state for r in placed]]
+        if len(here):
+            axis.scatter(
+                *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
+            )
+    axis.legend(loc="best")
     axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
     axis.set_aspect("equal", adjustable="datalim")
     axis.margins(0.08)
@@ -388,23 +343,3 @@ def _draw_map(
     )
     axis.set_xlabel(f"m east of the start ({place})")
     axis.set_ylabel("m north")
-
-
-def _by_state(figure: Any, axis: Any, placed: Sequence[WindowResult], at: Array) -> None:
-    for state, look in STATES.items():
-        here = at[[r.traversability.state is state for r in placed]]
-        if len(here):
-            axis.scatter(
-                *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
-            )
-    axis.legend(loc="best")
-
-
-def _by_draft(figure: Any, axis: Any, placed: Sequence[WindowResult], at: Array) -> None:
-    drafts = np.array(
-        [d.value / 1e3 if (d := r.traversability.max_draft) and of_use([r]) else math.nan for r in placed]
-    )
-    known = np.isfinite(drafts)
-    axis.plot(*at[~known].T, "x", color="0.5", ms=4)
-    points = axis.scatter(*at[known].T, s=34, c=drafts[known], cmap="viridis", edgecolors="0.25", linewidths=0.3)
-    figure.colorbar(points, ax=axis, label="largest draft, kN")

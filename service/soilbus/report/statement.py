@@ -210,21 +210,9 @@ def size_of(found: Detectable, size: float) -> str:
 
 
 def pressure_error(found: Detectable, before: Sequence[Posterior], config: Config) -> tuple[float, float]:
-    """Bearing pressure under an effect that these recordings could not have shown.
+    """Return relative error and reported relative std of the bearing pressure under an effect that stays unseen.
 
-    Parameters
-    ----------
-    found
-        The effect with its unseen size.
-    before
-        Soil of each recording as reported.
-    config
-        Names the reference plate.
-
-    Returns
-    -------
-    (float, float)
-        Relative error, and relative std as reported, of the recording in which their ratio is greatest.
+    They are of the recording in which their ratio is greatest; `before` is the soil of each as reported.
     """
     errors = []
     for posterior, soil_error in zip(before, found.soil_error, strict=True):

@@ -39,19 +39,7 @@ def sparkline(values: Series) -> str:
 
 
 def area(values: Series, height: int, top: float, limits: Series = ()) -> list[str]:
-    """Return the lines of a chart from 0 to `top`: values filled from below, limits as a line.
-
-    Parameters
-    ----------
-    values
-        One a column.
-    height
-        Rows.
-    top
-        Value at the upper edge; above 0.
-    limits
-        One a column, or none.
-    """
+    """Return the lines of a chart from 0 to `top`, one value a column, filled from below; limits are a line."""
     rows = [[" "] * len(values) for _ in range(height)]
     for column, limit in enumerate(limits):
         if limit is not None:

@@ -8,6 +8,7 @@ source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second;
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import sys
@@ -37,7 +38,7 @@ from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.received_record import gist, received_record
 from soilbus.words import shown
 
-__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch", "watch_log"]
+__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch"]
 
 REDRAW_PERIOD = 0.2
 """Time [s] between two pictures."""
@@ -59,16 +60,9 @@ class Source(Protocol):
 
 
 class PlayedLog:
-    """Frames of a recording, each when it is due.
+    """Frames of a recording, each when it is due by a clock [s], `speed` times as fast as they came.
 
-    Parameters
-    ----------
-    messages
-        In their order; one whose stamp goes back is due at once, and a silence takes LONGEST_GAP at most.
-    speed
-        Seconds of the recording per second.
-    clock, sleep
-        Monotonic time [s] and waiting by it.
+    One whose stamp goes back is due at once, and a silence takes LONGEST_GAP at most.
     """
 
     fault = ""
@@ -113,13 +107,7 @@ class PlayedLog:
 
 
 class Pace:
-    """Clock of a recording that is played: only `sleep` moves it on.
-
-    Parameters
-    ----------
-    speed
-        Seconds of the recording per second.
-    """
+    """Clock of a recording that is played `speed` times as fast: only `sleep` moves it on."""
 
     def __init__(self, speed: float) -> None:
         self._speed, self._began, self._now = speed, time.monotonic(), 0.0
@@ -136,88 +124,52 @@ class Pace:
 
 def watch(
     config: Config,
-    names_wheels: bool = True,
-    seconds: float | None = None,
-    plain: bool = False,
-    as_json: bool = False,
-) -> None:
-    """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
-
-    Parameters
-    ----------
-    config
-        Of bus, output.dbc and vehicle.
-    names_wheels
-        Whether the configuration is that of the vehicle that is watched.
-    seconds
-        After which to stop; None for never.
-    plain
-        Lines, even on a terminal.
-    as_json
-        A line of JSON for each window.
-
-    Raises
-    ------
-    BusError
-        The bus cannot be opened at the start.
-    """
-    database = output_database(config)
-    settings, filters = config.bus.model_dump(), filters_of(database)
-    with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
-        bus.open()
-        until = None if seconds is None else time.monotonic() + seconds
-        dashboard = Dashboard(ReceivedFrames(database), Vehicle.of(config, names_wheels))
-        _show_as(dashboard, bus, plain, as_json, lambda: until is not None and time.monotonic() >= until)
-
-
-def watch_log(
-    config: Config,
-    log: Path,
+    log: Path | None = None,
     speed: float = 1.0,
     names_wheels: bool = True,
     seconds: float | None = None,
     plain: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Show the dashboard of a recording of our frames in its own time, to its end.
+    """Show the dashboard of the configured bus, or of a recording of our frames in its own time, until interrupted.
 
-    Parameters
-    ----------
-    config, names_wheels, seconds, plain, as_json
-        As of `watch`.
-    log
-        In any format that python-can reads.
-    speed
-        Seconds of the recording per second.
+    A bus that goes away is waited for; a recording ends the command. With `names_wheels` the configuration is that of
+    the vehicle that is watched. After `seconds` it stops. `plain` gives lines even on a terminal, `as_json` a line of
+    JSON for each window.
 
     Raises
     ------
+    BusError
+        The bus cannot be opened at the start.
     LogError
-        It cannot be read, or has no frame of ours.
+        The recording cannot be read, or has no frame of ours.
     """
-    database = output_database(config)
-    ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
-    messages = (m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours)
-    pace = Pace(speed)
-    source = PlayedLog(messages, 1.0, pace, pace.sleep) if as_json else PlayedLog(messages, speed)
-    if source.is_over:
-        raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
-    until = None if seconds is None else time.monotonic() + seconds
-    dashboard = Dashboard(ReceivedFrames(database, source.now), Vehicle.of(config, names_wheels))
-    _show_as(
-        dashboard, source, plain, as_json,
-        lambda: source.is_over or (until is not None and time.monotonic() >= until),
-        stays=seconds is None,
-    )  # fmt: skip
+    database, vehicle = output_database(config), Vehicle.of(config, names_wheels)
+    until = math.inf if seconds is None else time.monotonic() + seconds
 
+    def show_from(source: Source, received: ReceivedFrames, stays: bool) -> None:
+        def done() -> bool:
+            return time.monotonic() >= until or (isinstance(source, PlayedLog) and source.is_over)
 
-def _show_as(
-    dashboard: Dashboard, source: Source, plain: bool, as_json: bool, done: Callable[[], bool], stays: bool = False
-) -> None:
-    if as_json:
-        print_results(dashboard, source, sys.stdout, done)
-    else:
-        show(dashboard, source, Console(), plain, done, stays=stays)
+        dashboard = Dashboard(received, vehicle)
+        if as_json:
+            print_results(dashboard, source, sys.stdout, done)
+        else:
+            show(dashboard, source, Console(), plain, done, stays=stays)
+
+    if log is not None:
+        ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
+        messages = (m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours)
+        pace = Pace(speed)
+        played = PlayedLog(messages, 1.0, pace, pace.sleep) if as_json else PlayedLog(messages, speed)
+        if played.is_over:
+            raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
+        show_from(played, ReceivedFrames(database, played.now), seconds is None)
+        return
+    settings, filters = config.bus.model_dump(), filters_of(database)
+    with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
+        bus.open()
+        show_from(bus, ReceivedFrames(database), False)
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
@@ -239,22 +191,8 @@ def show(
 ) -> None:
     """Feed frames and show them until `done`, or until a key ends it.
 
-    Parameters
-    ----------
-    dashboard
-        Takes the frames.
-    source
-        An open bus or a recording.
-    console
-        Where to draw; not a terminal, or one that moves no cursor: lines.
-    plain
-        Lines, even on a terminal.
-    done
-        Whether to stop, asked in every round.
-    clock
-        Monotonic time [s].
-    stays
-        Whether the last page stays until a key says so, where keys can be pressed.
+    Where the console is no terminal, or moves no cursor, or with `plain`, these are lines. With `stays` the last page
+    stays until a key says so.
     """
     if plain or not console.is_terminal or console.is_dumb_terminal:
         _show_lines(dashboard, source, console, done, clock)
@@ -301,16 +239,9 @@ def print_results(
     out: IO[str],
     done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Print a line of JSON for each received window, and for each change of state in between.
+    """Print a line of JSON for each received window, and for each change of state in between; each is flushed.
 
     A window's line waits for the verdict that rests on it, at most a cycle of the fast frames.
-
-    Parameters
-    ----------
-    dashboard, source, done
-        As of `show`.
-    out
-        Takes the lines; each is flushed.
     """
     received, said, stamp = dashboard.known, None, None
     first = received.now + FIRST_VERDICT

@@ -22,15 +22,7 @@ from soilbus.words import text_of
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
-    """Return the summary of a replay of logs.
-
-    Parameters
-    ----------
-    results
-        Every window.
-    pipeline
-        Counted frames and refusals while it made them.
-    """
+    """Return the summary of a replay of logs; the pipeline counted frames and refusals while it made the windows."""
     counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
     if counts.elsewhere:
@@ -49,22 +41,10 @@ def summary_of(
     no_slope: bool = False,
     doubted: Sequence[str] = (),
 ) -> str:
-    """Return the summary of windows from any source.
+    """Return the summary of windows that were `heard` from any source, such as "5000 mapped frames".
 
-    Parameters
-    ----------
-    results
-        Every window.
-    heard
-        What they were made from, such as "5000 mapped frames".
-    used
-        Samples used; None where that was not counted.
-    refused
-        Samples refused by reason.
-    no_slope
-        Whether no sensor shows the slope.
-    doubted
-        Lines on messages that cannot be trusted.
+    Samples used are None where they were not counted; `refused` is by reason. `no_slope` says that no sensor shows the
+    slope, `doubted` which messages cannot be trusted.
     """
     good = [r for r in results if r.status is Status.VALID]
     estimated = len(of_use(results)) - len(good)
@@ -117,15 +97,7 @@ def unused(results: Sequence[WindowResult]) -> int:
 
 
 def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
-    """Return one line on why no window has an estimate.
-
-    Parameters
-    ----------
-    results
-        Every window.
-    window
-        Length of a window [s].
-    """
+    """Return one line on why no window, each `window` [s] long, has an estimate."""
     if not results:
         return f"no window could be made: no recording lasts the {window:g} s of a window"
     (status, reason), group = by_reason(results)[0]

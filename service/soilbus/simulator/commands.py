@@ -28,10 +28,7 @@ _DRIVE, _TORQUE_LIMIT = "DriveCommand", "TorqueLimitCommand"
 class Commands:
     """The last commands, by the time at which they came.
 
-    Parameters
-    ----------
-    config
-        Names its wheels with their gears: FL, FR, RL and RR of the DBC are the first two and the last two.
+    The wheels FL, FR, RL and RR of the DBC are the first two and the last two of the configuration.
     """
 
     def __init__(self, config: Config) -> None:

@@ -22,18 +22,9 @@ __all__ = ["NORTHWARD", "Course", "course", "positions"]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Course of a drive over the ground: a start, a heading and rows.
+    """Course of a drive over the ground: a start [rad], the heading [rad] of the first row clockwise from north, rows.
 
-    Attributes
-    ----------
-    latitude, longitude
-        Start [rad].
-    heading
-        Of the first row [rad], clockwise from north.
-    row
-        Length of a row [m]; inf for a straight line.
-    spacing
-        Distance [m] of each row to the right of the one before.
+    A row is `row` [m] long, inf for a straight line; each lies `spacing` [m] to the right of the one before.
     """
 
     latitude: float = math.radians(52.43)
@@ -53,21 +44,9 @@ class Course:
 
 
 def course(start: Sequence[float] | None = None, heading: float = 0.0, rows: Sequence[float] | None = None) -> Course:
-    """Return a course from degrees.
+    """Return a course from a start [deg], a heading [deg] clockwise from north, and length and spacing of rows [m].
 
-    Parameters
-    ----------
-    start
-        Latitude and longitude [deg].
-    heading
-        [deg], clockwise from north.
-    rows
-        Length and spacing of the rows [m].
-
-    Raises
-    ------
-    ValueError
-        It cannot be driven.
+    ValueError for one that cannot be driven.
     """
     from_start = {} if start is None else dict(zip(("latitude", "longitude"), map(math.radians, start), strict=True))
     in_rows = {} if rows is None else dict(zip(("row", "spacing"), rows, strict=True))
@@ -79,19 +58,7 @@ NORTHWARD = Course()
 
 
 def positions(course: Course, distance: Array) -> tuple[Array, Array]:
-    """Return the positions on a course.
-
-    Parameters
-    ----------
-    course
-        The course.
-    distance
-        Distance driven [m] (N,).
-
-    Returns
-    -------
-    Latitudes and longitudes [rad] (N,).
-    """
+    """Return the latitudes and longitudes [rad] (N,) at these distances [m] (N,) on a course."""
     ahead, right = _in_field(course, distance)
     sine, cosine = math.sin(course.heading), math.cos(course.heading)
     north, east = cosine * ahead - sine * right, sine * ahead + cosine * right

@@ -97,14 +97,7 @@ class Drive:
 class Command:
     """Commands to the vehicle; without one the scenario holds.
 
-    Attributes
-    ----------
-    draft
-        Of the implement [N], as it is set: nobody lifts it.
-    speed
-        Ground speed [m/s].
-    torque_limit
-        At the wheel [N m], by wheel with a motor of its own.
+    Draft [N] of an implement that nobody lifts, ground speed [m/s], and torque limit at the wheel [N m] by its name.
     """
 
     draft: float | None = None
@@ -155,18 +148,9 @@ class _Place:
 
 
 def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
-    """Drive the configured vehicle through one realisation of a scenario.
+    """Drive the configured vehicle through one realisation of a scenario, which the seed picks.
 
-    Parameters
-    ----------
-    config
-        The vehicle, with the effects of config.model.effects.
-    scenario
-        Speed, soils, and draft or slip.
-    seed
-        Picks the realisation.
-    effects
-        Further effects.
+    Effects are those of config.model.effects and `effects`.
 
     Raises
     ------
@@ -189,25 +173,10 @@ def steps(
     step: float = STEP,
     commanded: Callable[[float], Command] = lambda t: NO_COMMAND,
 ) -> Iterator[Drive]:
-    """Yield a drive step by step, until the scenario ends or the vehicle has bogged down.
+    """Yield a drive (see `drive`) step by step, until the scenario ends or the vehicle has bogged down.
 
-    Parameters
-    ----------
-    config, scenario, seed, effects
-        As of `drive`.
-    step
-        Length of a step [s]; inf for one step.
-    commanded
-        Asked at the beginning of each step, with the time since the start [s]; it goes before the scenario.
-
-    Yields
-    ------
-    True values of each step; the last one says when it bogged down.
-
-    Raises
-    ------
-    SimulationError, KeyError, ConfigError
-        As `drive`.
+    `commanded` is asked at the beginning of each `step` [s], with the time since the start [s]; it goes before the
+    scenario.
     """
     plan = _plan(config, scenario, seed, (*effects_of(config), *effects))
     n = len(plan.t) if math.isinf(step) else max(round(step * SAMPLE_RATE), 1)
@@ -286,12 +255,7 @@ def _driven(plan: _Plan, part: slice, place: _Place, command: Command) -> tuple[
 def _motion(plan: _Plan, part: slice, place: _Place, wanted: float | None, possible: float) -> tuple[_Motion, _Place]:
     """Motion in a step, and speed and distance at its end.
 
-    Parameters
-    ----------
-    wanted
-        Ground speed [m/s]; None as the scenario has it.
-    possible
-        Greatest acceleration [m/s^2] that the wheels can give; inf where that is no question.
+    wanted: ground speed [m/s], None as the scenario has it; possible: greatest acceleration [m/s^2] of the wheels.
     """
     t, planned = plan.t[part], Wave(*(a[part] for a in plan.speed))
     begun = planned.value[0] if place.speed is None else place.speed
@@ -409,16 +373,8 @@ def _situation(
 ) -> Situation:
     """What is given in a step, with the forces of effects that resist.
 
-    Parameters
-    ----------
-    draft
-        Of the implement [N]; None as the scenario has it.
-    lifted
-        Whether the driver lifts the implement at his slip limit.
-    wanted
-        Ground speed [m/s]; None as the scenario has it.
-    torque_limit
-        At the wheel [N m], by name of the wheel.
+    Draft [N] and wanted speed [m/s] are None as the scenario has them; with `lifted` the driver lifts the implement at
+    his slip limit.
     """
     chassis, wheels, drivetrain = plan.chassis, plan.config.wheel, plan.mechanics.drivetrain
     climbs, side = plan.mechanics.climbs, plan.side[part]

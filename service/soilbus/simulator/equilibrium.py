@@ -184,24 +184,10 @@ class Equilibrium(NamedTuple):
 
 
 def solve(situation: Situation, mechanics: Mechanics, near: Equilibrium | None = None) -> Equilibrium:
-    """Return the equilibrium at each instant.
+    """Return the equilibrium at each instant; residuals are below 1e-10 of the vehicle's weight where `found`.
 
-    Parameters
-    ----------
-    situation
-        N instants of M wheels.
-    mechanics
-        Model and effects.
-    near
-        An equilibrium whose last instant is next to these; all of them start from it.
-
-    Returns
-    -------
-    Residuals are below 1e-10 of the vehicle's weight where `found`.
-
-    Notes
-    -----
-    Without `near` every tenth instant is solved first; the others start from values interpolated between them.
+    All instants start from the last one of `near`. Without it every tenth is solved first, and the others start from
+    values interpolated between these.
     """
     n_instants = len(situation.demand)
     if near is not None:
@@ -234,18 +220,9 @@ def _from_near(situation: Situation, mechanics: Mechanics, guess: _Guess) -> Equ
 
 
 def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft: Array) -> Surroundings:
-    """Return what effects may depend on.
+    """Return what effects may depend on, instants first: (N, M) or (N, 1).
 
-    Parameters
-    ----------
-    slip
-        Of the wheels (M, N).
-    draft
-        [N] (N,).
-
-    Returns
-    -------
-    Arrays with instants first, (N, M) or (N, 1).
+    Slips of the wheels are (M, N), the draft [N] is (N,).
     """
     towed = np.zeros_like(draft) if mechanics.climbs else draft
     return Surroundings(

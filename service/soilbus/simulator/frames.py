@@ -45,18 +45,9 @@ Payload = NDArray[np.uint8]
 def frames(
     recording: Recording, config: Config, database: Database | None = None, start: float = START_TIME
 ) -> Iterator[can.Message]:
-    """Yield the recording's frames in the order of their stamps.
+    """Yield the recording's frames in the order of their stamps, the first instant at `start` [s].
 
-    Parameters
-    ----------
-    recording
-        Sensor series.
-    config
-        Maps channels to messages.
-    database
-        DBC files of the configuration by default.
-    start
-        Stamp of the first instant [s].
+    Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
 
     Raises
     ------
@@ -64,25 +55,13 @@ def frames(
         As `channels_of`.
     ValueError
         A mapped message cannot be encoded.
-
-    Notes
-    -----
-    Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
     """
     encoder = Encoder(config, recording.seed, database, start)
     yield from encoder.frames(recording.channels, recording.truth)
 
 
 class Encoder:
-    """Encoder of the vehicle's frames, step by step: counters and jitter go on.
-
-    Parameters
-    ----------
-    config, database, start
-        As of `frames`.
-    seed
-        Of the recording; picks the jitter.
-    """
+    """Encoder of the vehicle's frames (see `frames`), step by step: counters and jitter go on."""
 
     def __init__(self, config: Config, seed: int, database: Database | None = None, start: float = START_TIME) -> None:
         database = database if database is not None else load_databases(config)
@@ -123,18 +102,9 @@ def _after(last: Column | None, column: Column) -> Column:
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:
-    """Return payloads from raw codes.
+    """Return the payloads (N, length) of a message from raw codes (N,) by signal name.
 
-    Parameters
-    ----------
-    message
-        Layout.
-    codes
-        Raw codes (N,) by signal name.
-
-    Returns
-    -------
-    Bytes (N, length). Bits of no signal are ones; Checksum, where the message has one, is computed last.
+    Bits of no signal are ones; Checksum, where the message has one, is computed last.
     """
     length = message.length
     n_frames = len(next(iter(codes.values())))

@@ -31,20 +31,7 @@ Step = tuple[Drive, list[can.Message]]
 def driven_frames(
     config: Config, scenario: Scenario, seed: int, commanded: Callable[[float], Command]
 ) -> Iterator[Step]:
-    """Yield a drive with its frames, step by step.
-
-    Parameters
-    ----------
-    config, scenario, seed
-        As of `simulate`.
-    commanded
-        Asked at the beginning of each step, with the time since the start [s].
-
-    Raises
-    ------
-    SimulationError, KeyError, ConfigError
-        As `drive.drive`.
-    """
+    """Yield a drive with its frames, step by step (see `drive.steps`)."""
     instruments, encoder = Instruments(config, seed, scenario.vehicle_seed), Encoder(config, seed)
     for done in steps(config, scenario, seed, commanded=commanded):
         frames: list[can.Message] = []
@@ -54,18 +41,9 @@ def driven_frames(
 
 
 def drive_live(config: Config, scenario: Scenario, seed: int, driven: MutableSequence[Drive]) -> float:
-    """Drive on the configured bus in real time, by the commands on it.
+    """Drive on the configured bus in real time, by the commands on it; return the system time [s] of the start.
 
-    Parameters
-    ----------
-    config, scenario, seed
-        As of `simulate`.
-    driven
-        Takes the true values of each step before its frames are sent; their times t [s] count from the start.
-
-    Returns
-    -------
-    System time [s] of the start.
+    `driven` takes the true values of each step before its frames are sent; their times t [s] count from the start.
 
     Raises
     ------

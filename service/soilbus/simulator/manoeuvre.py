@@ -35,22 +35,10 @@ RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """Manoeuvre: values at times, with straight lines between them.
+    """Manoeuvre: values at times [s] that ascend from 0, with straight lines between them, and words on what varies.
 
-    Attributes
-    ----------
-    t
-        [s], ascending from 0.
-    slip
-        Common slip of the driven wheels.
-    speed
-        Ground speed [m/s].
-    side_load
-        Share of an axle's load that a side slope moves to its left wheel.
-    slope
-        [rad], uphill positive.
-    words
-        What varies, in words.
+    The slip is common to the driven wheels, the speed that over ground [m/s]; `side_load` is the share of an axle's
+    load that a side slope moves to its left wheel, a slope [rad] is positive uphill.
     """
 
     t: tuple[float, ...]
@@ -91,13 +79,7 @@ class Manoeuvre:
 
 
 def of_json(text: str) -> Manoeuvre:
-    """Return a manoeuvre from its JSON, or from the `manoeuvre` of a diagnosis.
-
-    Raises
-    ------
-    ValueError
-        The text is no JSON, or has no manoeuvre.
-    """
+    """Return a manoeuvre from its JSON, or from the `manoeuvre` of a diagnosis; ValueError where there is none."""
     try:
         document = json.loads(text)
     except ValueError:

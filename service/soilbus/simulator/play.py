@@ -26,29 +26,10 @@ def scenario_over(
     speed: float | None = None,
     vehicle_seed: int | None = None,
 ) -> Scenario:
-    """Return a scenario over several soils, each for an equal part of the time.
+    """Return a scenario over several soils, each for an equal part of the time; KeyError for an unknown one.
 
-    Parameters
-    ----------
-    soils
-        Their names.
-    duration
-        [s].
-    course
-        Where on the earth.
-    draft
-        Of the implement [N], which nobody lifts; None sweeps slip from 0.05 to 0.40.
-    grade
-        Slope, rise over run; uphill is positive.
-    speed
-        Wanted ground speed [m/s]; None lets it swing from 1.0 to 1.8.
-    vehicle_seed
-        Picks true mass and sensor gains (see Scenario).
-
-    Raises
-    ------
-    KeyError
-        A soil is unknown.
+    Nobody lifts the implement of a given draft [N]; without one slip sweeps from 0.05 to 0.40. The grade is rise over
+    run. Without a speed [m/s] it swings from 1.0 to 1.8. `vehicle_seed` picks true mass and sensor gains.
     """
     for name in soils:
         if name not in SOILS:
@@ -70,15 +51,7 @@ def scenario_over(
 
 
 def send_in_time(messages: Iterable[can.Message], send: Callable[[can.Message], None]) -> None:
-    """Send messages spaced as their stamps are.
-
-    Parameters
-    ----------
-    messages
-        In the order of their stamps.
-    send
-        Sends one.
-    """
+    """Send messages, in the order of their stamps, spaced as these are."""
     first: float | None = None
     begin = time.monotonic()
     for message in messages:

@@ -20,18 +20,9 @@ __all__ = ["Recording", "recorded", "simulate"]
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A simulated drive.
+    """A simulated drive: true values (see drive.Drive) and noisy samples by channel name, in SI, of one seed.
 
-    Attributes
-    ----------
-    truth
-        True values (N,) by column name, SI (see drive.Drive).
-    channels
-        Noisy samples by channel name, SI.
-    seed
-        Of the realisation.
-    bogged_at
-        Time [s] at which the tractor got stuck and the recording ends; None where it did not.
+    `bogged_at` is the time [s] at which the tractor got stuck and the recording ends; None where it did not.
     """
 
     truth: dict[str, NDArray[Any]]
@@ -43,21 +34,8 @@ class Recording:
 def simulate(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Recording:
     """Drive the configured vehicle through a scenario and measure it; the same seed gives the same recording.
 
-    Parameters
-    ----------
-    config
-        The vehicle, with the effects of config.model.effects.
-    scenario
-        What to drive.
-    seed
-        Picks slips, loads, noise and gain errors.
-    effects
-        Further effects.
-
-    Raises
-    ------
-    SimulationError, KeyError, ConfigError
-        As `drive.drive`.
+    Effects are those of config.model.effects and `effects`. The seed picks slips, loads, noise and gain errors. Errors
+    are those of `drive.drive`.
     """
     return recorded(drive(config, scenario, seed, effects), config, scenario, seed)
 

@@ -46,15 +46,10 @@ _REFERENCE_TIME = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Swing:
-    """A quantity that moves between low and high as a sum of four slow sines.
+    """A quantity that moves between bounds, which it touches in a drive of a minute, as a sum of four slow sines.
 
-    Attributes
-    ----------
-    low, high
-        Bounds, which it touches in a drive of a minute.
-    slowest, fastest
-        Frequencies [Hz]. By default 0.05 to 0.12: next to nothing happens between two samples, and one window of 10 s
-        still sees many states of the wheels.
+    At their frequencies [Hz] next to nothing happens between two samples, and one window of 10 s still sees many states
+    of the wheels.
     """
 
     low: float
@@ -90,17 +85,7 @@ class Wave(NamedTuple):
 
 
 def realise(swing: Swing | Profile, t: Array, rng: np.random.Generator) -> Wave:
-    """Return a random wave.
-
-    Parameters
-    ----------
-    swing
-        Its bounds and frequencies, or given values, which are returned as they are.
-    t
-        Times [s] (N,), ascending from 0.
-    rng
-        Picks frequencies and phases.
-    """
+    """Return a random wave at times [s] (N,) that ascend from 0; given values are returned as they are."""
     if isinstance(swing, Profile):
         value = np.interp(t, swing.t, swing.value)
         area = np.cumsum((value[1:] + value[:-1]) / 2.0 * np.diff(t))

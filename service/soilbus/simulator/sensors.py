@@ -110,36 +110,17 @@ def fitted(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def measure(drive: Drive, config: Config, seed: int, vehicle_seed: int | None = None) -> dict[str, Column]:
-    """Return the noisy samples of every mapped channel.
+    """Return the noisy samples of every mapped channel in SI, by channel name, of the true values of a drive.
 
-    Parameters
-    ----------
-    drive
-        True values, with the effects that acted.
-    config
-        Maps channels; [noise] gives gain errors and noise, `delay` of a signal its delay [s].
-    seed
-        Picks gain errors and noise.
-    vehicle_seed
-        Picks gain errors in its place.
-
-    Returns
-    -------
-    SI, by channel name (can.channels).
+    [noise] gives gain errors and noise, `delay` of a signal its delay [s]. The seed picks both, `vehicle_seed` gain
+    errors in its place.
     """
     return Instruments(config, seed, vehicle_seed).measure(drive)
 
 
 class Instruments:
-    """Sensors of one vehicle, which measure a drive step by step.
+    """Sensors of one vehicle, which measure a drive step by step (see `measure`).
 
-    Parameters
-    ----------
-    config, seed, vehicle_seed
-        As of `measure`.
-
-    Notes
-    -----
     Gain errors are drawn once and noise goes on from step to step. What delays and low passes need of the time before a
     step is kept for HISTORY seconds.
     """

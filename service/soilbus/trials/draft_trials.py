@@ -108,21 +108,8 @@ def true_largest_draft(
 ) -> float:  # fmt: skip
     """Return the largest draft [N] held steadily on level ground; nan where there is none.
 
-    Parameters
-    ----------
-    torque_limit
-        Of the wheels (W,) [N m]; nan for none.
-    max_slip, max_sinkage
-        Greatest slip and sinkage [m] of a wheel.
-    drivetrain
-        What turns the wheels, with the limits of axles; by default a motor for each wheel.
-    side_shift
-        Share of each axle's load that a side slope moves to its left wheel.
-
-    Raises
-    ------
-    ValueError
-        The rig has no chassis.
+    Torque limits of the wheels (W,) are in N m, nan for none; without a drivetrain each wheel has a motor. A side slope
+    moves `side_shift` of each axle's load to its left wheel. ValueError where the rig has no chassis.
     """
     if rig.chassis is None:
         raise ValueError("a draft needs the vehicle's mass and geometry")

@@ -189,15 +189,6 @@ class WheelEquations:
     def solve(self, measured: Forces, n: float) -> Solution:
         """Solve the same equations by Newton's method on 1/(n + 3/2) alone.
 
-        Parameters
-        ----------
-        measured
-            Forces.
-        n
-            Start.
-
-        Notes
-        -----
         For a given n the forces are linear in K_L and in s = K_L tan(phi), so T gives s and W then K_L; the remaining
         residual of the drawbar pull must be zero.
         """
@@ -222,8 +213,6 @@ class WheelEquations:
     def all_solutions(self, measured: Forces) -> list[Unknowns]:
         """Return every soil with n up to 3 that solves the equations, from no particular start.
 
-        Notes
-        -----
         They are where the residual of the drawbar pull changes sign on 100 equal steps of n.
         """
         n = np.linspace(0.03, 3.0, 100)

@@ -180,15 +180,7 @@ def _cells(row: PaperRow) -> tuple[str, ...]:
 
 
 def paper_table(number: int, sinkage: float) -> PaperTable:
-    """Return a table of the paper with ours beside it.
-
-    Parameters
-    ----------
-    number
-        One of START_ERRORS.
-    sinkage
-        Of the simulated wheels [m].
-    """
+    """Return a table of the paper, one of START_ERRORS, with ours beside it for wheels of this sinkage [m]."""
     runs = [run for run in RUNS if run.table == number]
     ours = [(_newton(run, sinkage), _seconds(run, sinkage)) for run in runs]
     rows = []

@@ -70,13 +70,7 @@ def first_window(config: Config, recording: Recording, torque_limit: NDArray[np.
 
 
 def fit_from_soil(problem: ObservationModel, prior: SoilPrior, start: Soil) -> Fit | None:
-    """Return the fit of a window from one soil: the soil alone first, then all together.
-
-    Returns
-    -------
-    Fit or None
-        None where the numbers are not finite.
-    """
+    """Return the fit of a window from one soil, first alone, then all together; None where numbers are not finite."""
     gains, joint_prior = np.zeros(len(problem.gain_std)), Gaussian.of(prior, problem.gain_std)
     begin = Start(np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median), gains)
     fits = fit_jointly([problem], prior, [joint_prior], gains > 0.0, [begin], problem.options.search.cold)

@@ -46,19 +46,10 @@ MEASUREMENTS: tuple[Measurement, ...] = (
 
 
 def run_bench() -> dict[str, Any]:
-    """Measure every figure.
+    """Return the value of every figure by its name, beside "details" of each and the "machine".
 
-    Returns
-    -------
-    Value by figure's name, beside "details" of each and the "machine".
-
-    Raises
-    ------
-    ModuleNotFoundError
-        threadpoolctl is not installed; one line for the user.
-    AssertionError
-        Ours and a peer come to different results.
-
+    ModuleNotFoundError where threadpoolctl is not installed; AssertionError where ours and a peer come to different
+    results.
     """
     try:
         from threadpoolctl import threadpool_limits
