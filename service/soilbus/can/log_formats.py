@@ -28,6 +28,7 @@ from typing import NamedTuple
 import can
 
 from soilbus.can.candump import Batch, candump_batches, is_candump, of_message
+from soilbus.can.mcap_frames import frame_batches
 from soilbus.files import LIMITS, text_lines, within_ratio
 
 HEAD = 1 << 13
@@ -345,6 +346,14 @@ def check_mf4_blocks(path: Path) -> None:
             within_ratio(size, plain)
 
 
+def _mcap(stream: BufferedReader) -> Iterator[Batch]:
+    try:
+        import mcap  # noqa: F401
+    except ModuleNotFoundError:
+        raise MissingExtraError("this format needs soilbus[mcap]") from None
+    return frame_batches(stream)
+
+
 _SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages"
 
 
@@ -373,10 +382,10 @@ def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
 _BINARY = {
     b"LOGG": Format("BLF log", _blf),
     b"MDF     4": Format("MF4 log", _mf4),
+    b"\x89MCAP": Format("MCAP log", _mcap),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
 }
 _NO_FRAMES = {
-    b"\x89MCAP": "an MCAP file, such as replay --mcap writes of its results",
     b"PAR1": "a Parquet table",
     b"UnFinMF ": "an MDF file that was never finished",
     b"MDF     ": "an MDF file of version 3",

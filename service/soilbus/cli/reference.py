@@ -143,13 +143,13 @@ def commands_page() -> str:
         " `--set KEY=VALUE` overrides a value by its dotted path, as in `--set soil.c.value=5000` or"
         " `--set wheel.FL.radius=0.51`. Commands that take both say so, with the configuration that they take"
         " otherwise.\n\nLogs are recognised by content, whatever their name: candump (`-L`, or its console output with"
-        " stamps), SavvyCAN (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4, SQLite"
-        " of python-can; plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as"
+        " stamps), SavvyCAN (GVRET), CANedge and python-can CSV, BUSMASTER, PCAN TRC, Vector ASC and BLF, MF4,"
+        " MCAP of `replay --mcap`, SQLite of python-can; plain or packed by gzip, bzip2, xz or zstd. `-` is standard input. Stamps by date count as"
         " UTC. Of a log with several channels `bus.channel` is read, or `--channel`; the others are counted and said."
         " `canN` is also the channel numbered N + 1, or N in a log whose numbers begin at 0; a log of one other channel"
         " is read, with a line that says so.\n\n"
-        "MF4 needs the extra `mf4`, zstd `tables`, `--report` `plots`, `bench` `peers`, `completion` the extra of its"
-        " name.\n"
+        "MF4 needs the extra `mf4`, MCAP `mcap`, zstd `tables`, `--report` `plots`, `bench` `peers`, `completion`"
+        " the extra of its name.\n"
     )
     for name, command in subcommands(command_line()).items():
         text += f"\n## soilbus {name}\n\n{command.description}\n\n{_arguments(command)}"
