@@ -65,6 +65,11 @@ def wrapped(t: float) -> int:
     return (2**31 - 1_000_000 + round((t - BEGIN) * 1e6) + 2**31) % 2**32 - 2**31
 
 
+def decimal_asc(t: float, identifier: str, data: bytes) -> str:
+    name = f"{int(identifier, 16)}{'x' * is_extended(identifier)}"
+    return f"{t - BEGIN:11.6f} 1  {name:15s} Rx   d {len(data)} {' '.join(map(str, data))}"
+
+
 GVRET = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8"
 BUSMASTER = """***BUSMASTER Ver 3.2.2***
 ***PROTOCOL CAN***
@@ -113,11 +118,8 @@ TEXTS: dict[str, tuple[str, Row]] = {
         ASC.format(day="Fri May 05", year=2024, base="hex", start=""),
         lambda t, i, d: f"{t - BEGIN:11.6f} 1  {i + 'x' * is_extended(i):15s} Rx   d {len(d)} {spaced(d)}  ID = 4",
     ),
-    "asc, decimal, of a German month": (
-        ASC.format(day="Die Mär 05", year=2024, base="dec", start=""),
-        lambda t, i, d: f"{t - BEGIN:11.6f} 1  {str(int(i, 16)) + 'x' * is_extended(i):15s} Rx   d {len(d)} "
-        + " ".join(map(str, d)),
-    ),
+    "asc, decimal, of a German month": (ASC.format(day="Die Mär 05", year=2024, base="dec", start=""), decimal_asc),
+    "asc, decimal, of a French month": (ASC.format(day="mar. févr. 13", year=2024, base="dec", start=""), decimal_asc),
     "asc of CAN FD": (
         ASC.format(day="Fri May 05", year=2024, base="hex", start="CANFD   "),
         lambda t, i, d: f"{t - BEGIN:11.6f} CANFD   1 Rx {i + 'x' * is_extended(i):>11s}   1 0 {len(d):x} {len(d)} "

@@ -90,8 +90,9 @@ _ASC_LINE = re.compile(
     re.IGNORECASE,
 )
 _TRC_LINE = re.compile(r"\d+\)\s+\d")
-_ASC_NO_FRAME = re.compile(r"\s*+[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s)")
-"""Events that python-can would take for frames: "Start of measurement" of CAN FD, requests to send."""
+_ASC_NO_FRAME = re.compile(r"\s*+(date\s|[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s))", re.IGNORECASE)
+"""Events that python-can would take for frames ("Start of measurement" of CAN FD, requests to send), and the date:
+in some languages python-can does not know it and reads no base after it."""
 RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
