@@ -218,7 +218,8 @@ def test_an_mf4_of_decoded_signals_has_its_reason(tmp_path: Path) -> None:
     with pytest.raises(LogError) as fault:
         list(Log(path).frames())
     assert str(fault.value) == (
-        f"{path}: not a CAN log that can be read (it has no CAN frames: decoded signals, perhaps)"
+        f"{path}: not a CAN log that can be read (it has no CAN frames; if it holds decoded signals, soilbus init"
+        " --table maps them)"
     )
 
 

@@ -229,12 +229,7 @@ class Admission:
                 out.columns[channel.name] = Column(_NONE, _NONE)
             return
         self.counts.admitted[inbox.message.name] += len(batch.t)
-        blocks = batch.blocks(inbox.decoder)
-        plain = inbox.plain.samples(blocks) if inbox.plain is not None else None
-        if plain is not None:
-            out.columns.update((name, Column(batch.t, value)) for name, value in plain.items())
-            return
-        columns = inbox.decoder.columns_of(blocks)
+        columns = batch.columns(inbox.decoder)
         for channel, rule in zip(inbox.channels, inbox.rules, strict=True):
             _judge(channel, rule, inbox.message, batch.t, columns, out)
 

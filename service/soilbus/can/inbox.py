@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from soilbus.arrays import Mask
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
-from soilbus.can.decode import Block, ColumnDecoder
+from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
-from soilbus.can.plain import PlainPlan, plain_plan
 from soilbus.can.validity import CodeRule, rule_of
 
 TWICE = 0.002
@@ -40,13 +39,13 @@ class Batch:
     t: NDArray[np.float64]
     ids: NDArray[np.int64]
     payload: NDArray[np.uint8]
-    _blocks: list[Block] | None = None
+    _columns: dict[str, SignalColumn] | None = None
 
-    def blocks(self, decoder: ColumnDecoder) -> list[Block]:
+    def columns(self, decoder: ColumnDecoder) -> dict[str, SignalColumn]:
         """Return the payload as the message's decoder decodes it."""
-        if self._blocks is None:
-            self._blocks = decoder.blocks(self.payload)
-        return self._blocks
+        if self._columns is None:
+            self._columns = decoder.columns(self.payload)
+        return self._columns
 
     def where(self, mask: Mask) -> Batch:
         """Return the frames of a mask (N,)."""
@@ -61,7 +60,6 @@ class Inbox:
     channels: tuple[Channel, ...]
     rules: tuple[CodeRule, ...]
     decoder: ColumnDecoder
-    plain: PlainPlan | None
     lock: SourceLock | None
     checksum_byte: int | None
     frames: list[Frame] = field(default_factory=list)
@@ -105,7 +103,6 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
         channels=tuple(channels),
         rules=rules,
         decoder=decoder,
-        plain=plain_plan(message, channels, rules, decoder),
         lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
         checksum_byte=place,
     )
@@ -153,8 +150,7 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
     inbox.untrusted = None
     if inbox.checksum_byte is None:
         return None
-    column = inbox.decoder.columns_of(batch.blocks(inbox.decoder))[COUNTER]
-    counter = column.raw.astype(np.int64)
+    counter = batch.columns(inbox.decoder)[COUNTER].raw.astype(np.int64)
     modulus = 1 << inbox.message.get_signal_by_name(COUNTER).length
     step = np.diff(counter, prepend=inbox.last_counter) % modulus
     follows = np.diff(batch.ids, prepend=inbox.last_id) == 0

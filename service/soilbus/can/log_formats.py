@@ -35,6 +35,7 @@ HEAD = 1 << 13
 """Bytes at the begin of a log by which its format is recognised."""
 WRAP = 1 << 32
 """Microseconds after which the stamps of an analyser of 32 bits begin again."""
+OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
 DAY = 86400.0
 """Seconds after which a clock of hours, minutes and seconds begins again."""
 
@@ -77,7 +78,7 @@ def format_of(head: bytes) -> Format:
     if "\0" in text or "\ufffd" in text:
         raise ValueError("binary data of no known format")
     if columns := [cell for cell in re.split("[,;\t]", first) if cell.strip()][1:]:
-        raise ValueError(f"a table, whose {len(columns) + 1} columns are not those of CAN frames")
+        raise ValueError(f"a table, whose {len(columns) + 1} columns are not those of CAN frames; {OF_SIGNALS}")
     raise ValueError("text of no known format")
 
 
@@ -313,7 +314,7 @@ def _mf4(stream: BufferedReader) -> Iterator[Batch]:
                 is_empty = False
                 yield of_message(message)
         if is_empty:
-            raise ValueError("it has no CAN frames: decoded signals, perhaps")
+            raise ValueError(f"it has no CAN frames; {OF_SIGNALS}")
 
 
 def _mf4_reader(path: Path) -> can.MF4Reader:
