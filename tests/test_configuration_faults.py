@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.mapping import channels_of
 from soilbus.cli.main import main
 from soilbus.config.file import load_config, machine, overridden, parse_config
 from soilbus.config.model import Config, ConfigError

@@ -9,7 +9,6 @@ from typing import NamedTuple
 from cantools.database.can import Database, Message, Signal
 
 from soilbus.can.channels import WHOLE, Channel
-from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
 from soilbus.can.validity import meaning, vouching_codes
@@ -325,36 +324,28 @@ def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple
         radii = [w.radius for w in config.wheel if part.name in ("both", w.axle)] or [radius]
         if part.name == "both":  # its shaft turns faster, with less torque
             ratios = [a.gear_ratio for a in config.axle if a.name != "both"] or [1.0]
-            if quantity == "speed":
-                return -MAX_SPEED / min(radii) * max(ratios), MAX_SPEED / min(radii) * max(ratios)
-            radii = [r / min(ratios) for r in radii]
+            radii = [r / (max(ratios) if quantity == "speed" else min(ratios)) for r in radii]
         radius = min(radii) if quantity == "speed" else max(radii)
-    match quantity:
-        case "torque" | "torque_limit":
-            return -2.0 * weight * radius, 2.0 * weight * radius
-        case "speed" | "motor_speed":
-            return -MAX_SPEED / radius, MAX_SPEED / radius
-        case "load":
-            return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
-        case "sinkage":
-            return -0.1 * radius, radius
-        case "ground_speed":
-            return -MAX_SPEED, MAX_SPEED
-        case "draft":
-            return -2.0 * weight, 2.0 * weight
-        case "pitch":
-            return -1.0, 1.0
-        case "acceleration":
-            return -20.0, 20.0
-        case "roll" | "steering_angle":
-            return -1.6, 1.6
-        case "yaw_rate":
-            return -4.0, 4.0  # a skid-steered rover on the spot
-        case "latitude":
-            return -math.pi / 2.0, math.pi / 2.0
-        case "longitude":
-            return -math.pi - 1e-9, math.pi + 1e-9  # 180 degrees, however it is rounded
-    return -math.inf, math.inf
+    if quantity == "load":
+        return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
+    if quantity == "sinkage":
+        return -0.1 * radius, radius
+    greatest = {
+        "torque": 2.0 * weight * radius,
+        "torque_limit": 2.0 * weight * radius,
+        "speed": MAX_SPEED / radius,
+        "motor_speed": MAX_SPEED / radius,
+        "ground_speed": MAX_SPEED,
+        "draft": 2.0 * weight,
+        "pitch": 1.0,
+        "roll": 1.6,
+        "steering_angle": 1.6,
+        "acceleration": 20.0,
+        "yaw_rate": 4.0,  # a skid-steered rover on the spot
+        "latitude": math.pi / 2.0,
+        "longitude": math.pi + 1e-9,  # 180 degrees, however it is rounded
+    }.get(quantity, math.inf)
+    return -greatest, greatest
 
 
 def _mapped_twice(roles: Iterable[_Role]) -> list[str]:
@@ -383,6 +374,3 @@ def _identifiers_shared(channels: Iterable[Channel], database: Database) -> list
         if known != name:
             faults.append(f"messages {known} and {name} have the same identifier {message.frame_id:#x}")
     return faults
-
-
-__all__ = ["channels_of", "checked_messages", "found_signal", "load_databases", "plausible", "without_unit"]
