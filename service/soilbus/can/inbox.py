@@ -118,32 +118,27 @@ def popped(inbox: Inbox, until: float) -> list[Frame]:
 
 
 def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where the payload does not give the Checksum; None where all do, or none is asked for."""
+    """Return False where the payload does not give the Checksum; None where none is asked for."""
     if inbox.checksum_byte is None:
         return None
-    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
-    right: Mask = batch.payload[:, inbox.checksum_byte] == due
-    return None if np.count_nonzero(right) == len(right) else right
+    right: Mask = batch.payload[:, inbox.checksum_byte] == column_checksums(
+        batch.ids, batch.payload, inbox.checksum_byte
+    )
+    return right
 
 
-def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where time goes back or is no number; None where it always goes on."""
-    t = batch.t
-    first, last = float(t[0]), float(t[-1])
-    rises = np.count_nonzero(t[1:] >= t[:-1]) == len(t) - 1  # never of a nan
-    if rises and first >= inbox.last_t and math.isfinite(first) and math.isfinite(last):
-        inbox.last_t = last
-        return None
-    mask = np.zeros(len(t), dtype=np.bool_)
-    for i, now in enumerate(t.tolist()):
-        if math.isfinite(now) and now >= inbox.last_t:
-            mask[i] = True
-            inbox.last_t = now
-    return mask
+def time_forward(inbox: Inbox, batch: Batch) -> Mask:
+    """Return False where time goes back or is no number."""
+    is_time = np.isfinite(batch.t)
+    t = np.where(is_time, batch.t, -math.inf)
+    newest = np.maximum.accumulate(np.concatenate([[inbox.last_t], t]))
+    inbox.last_t = float(newest[-1])
+    forward: Mask = is_time & (t >= newest[:-1])
+    return forward
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where a frame repeats the counter of its sender's last one; None where none does.
+    """Return False where a frame repeats the counter of its sender's last one; None where no counter is checked.
 
     What the counters skip is counted in `inbox.missed`; what cannot be trusted is kept for `of_one_sender`.
     """
@@ -161,7 +156,7 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
     inbox.missed += int(np.maximum(step - 1, 0)[follows if untrusted is None else follows & ~untrusted].sum())
     if untrusted is not None:
         inbox.untrusted = untrusted[moved]
-    return None if moved.all() else moved
+    return moved
 
 
 def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mask) -> Mask | None:
