@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.mapping import channels_of
 from soilbus.cli.main import main
 from soilbus.config.file import load_config, machine, overridden, parse_config
 from soilbus.config.model import Config, ConfigError
@@ -116,6 +117,16 @@ def test_axles_of_own_names_stand_in_the_order_of_their_tables():
         ("noise.load=0.01", "noise.load: 0.01 is a single value; write it as a table with any of absolute, relative,"),
         ("wheel.FL.radus=0.5", "wheel.FL.radus: unknown key; did you mean radius?"),
         ("signals.ground_sped=A.B", "signals.ground_sped: unknown key; did you mean ground_speed?"),
+        (
+            "estimator.max_chi2=2.0",
+            "estimator.max_chi2: is gone: chi-square judges no window any more: remove it;"
+            " max_prediction_error, a share of torque and pull, judges now",
+        ),
+        (
+            "estimator.min_track_load_change=0.1",
+            "estimator.min_track_load_change: is gone: windows at a constant load are judged by their widths: remove"
+            " it",
+        ),
         ("estimatr.hop=1", "estimatr: unknown key; did you mean estimator?"),
         ("bus.chanel=can1", "bus: chanel: unknown key; did you mean channel?"),
         ("model.shear_law=rationl", 'model.shear_law: "rationl" is not one of exponential, rational; did you mean'),

@@ -10,7 +10,8 @@ import pytest
 from field_data import FIELD, field_config, field_database, frames_of, needs_field
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Decoded, Reason
-from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.mapping import channels_of
 
 
 def play(log: str, a: Admission) -> Decoded:

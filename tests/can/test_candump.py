@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator
+from itertools import chain
 
 import can
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from soilbus.can.candump import Frame, candump_frames, frame_of, whole
+from soilbus.can.candump import Frame, candump_batches, frame_of, whole
 
 PLAIN = "(1700000000.000266) can0 18FF2211#025415B303000000\n"
 
@@ -31,6 +32,10 @@ plain_lines = st.builds("{} {} {}#{}{}\n".format, times, channels, identifiers, 
 any_lines = st.builds("{} {} {}#{}{}\n".format, times, channels, identifiers | flagged, any_data, directions)
 odd_lines = st.sampled_from(["\n", "  \n", "(1.5)  can0   123#00\n", "(2.5) can0 123#00 r\n", "(1e3) c#n 123#00\n"])
 garbage = st.text("()#.R 0129AFcan\t", max_size=40).map("{}\n".format)
+
+
+def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
+    return chain.from_iterable(frames for _, frames in candump_batches(lines))
 
 
 def outcome(frames: Iterator[Frame]) -> tuple[list[Frame], type[Exception] | None, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import json
 import lzma
 import sqlite3
 from collections.abc import Callable
@@ -16,8 +17,10 @@ import asammdf
 import can
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, Writer
 
 from soilbus.can.logs import Log, LogError
+from soilbus.can.mcap_frames import frame_message
 
 BEGIN = 1_700_000_000.0
 _random = Random(51)
@@ -60,6 +63,11 @@ def of_day(t: float) -> str:
 def wrapped(t: float) -> int:
     """Microseconds of a signed counter of 32 bits that begins again after a second."""
     return (2**31 - 1_000_000 + round((t - BEGIN) * 1e6) + 2**31) % 2**32 - 2**31
+
+
+def decimal_asc(t: float, identifier: str, data: bytes) -> str:
+    name = f"{int(identifier, 16)}{'x' * is_extended(identifier)}"
+    return f"{t - BEGIN:11.6f} 1  {name:15s} Rx   d {len(data)} {' '.join(map(str, data))}"
 
 
 GVRET = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8"
@@ -110,11 +118,8 @@ TEXTS: dict[str, tuple[str, Row]] = {
         ASC.format(day="Fri May 05", year=2024, base="hex", start=""),
         lambda t, i, d: f"{t - BEGIN:11.6f} 1  {i + 'x' * is_extended(i):15s} Rx   d {len(d)} {spaced(d)}  ID = 4",
     ),
-    "asc, decimal, of a German month": (
-        ASC.format(day="Die Mär 05", year=2024, base="dec", start=""),
-        lambda t, i, d: f"{t - BEGIN:11.6f} 1  {str(int(i, 16)) + 'x' * is_extended(i):15s} Rx   d {len(d)} "
-        + " ".join(map(str, d)),
-    ),
+    "asc, decimal, of a German month": (ASC.format(day="Die Mär 05", year=2024, base="dec", start=""), decimal_asc),
+    "asc, decimal, of a French month": (ASC.format(day="mar. févr. 13", year=2024, base="dec", start=""), decimal_asc),
     "asc of CAN FD": (
         ASC.format(day="Fri May 05", year=2024, base="hex", start="CANFD   "),
         lambda t, i, d: f"{t - BEGIN:11.6f} CANFD   1 Rx {i + 'x' * is_extended(i):>11s}   1 0 {len(d):x} {len(d)} "
@@ -162,6 +167,47 @@ def test_what_python_can_writes_gives_the_frames(kind: str, tmp_path: Path) -> N
     check_same(Log(path, "can0"), 1e-5)
 
 
+def mcap_of(path: Path, topics: dict[str, list[bytes]], compression: CompressionType) -> None:
+    """An MCAP file of JSON messages by the name of their schema."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start()
+        for name, messages in topics.items():
+            channel = writer.register_channel(f"/{name}", "json", writer.register_schema(name, "jsonschema", b"{}"))
+            for message in messages:
+                writer.add_message(channel, 0, message, 0)
+        writer.finish()
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_an_mcap_of_frames_gives_the_frames(compression: CompressionType, tmp_path: Path) -> None:
+    messages = [
+        frame_message("can0", (t, int(identifier, 16), is_extended(identifier), data, False, False))
+        for t, identifier, data in FRAMES
+    ]
+    said = [json.dumps(message).encode() for message in messages]
+    mcap_of(tmp_path / "drive", {"other": [b"{}"], "can_msgs/Frame": said}, compression)
+    check_same(Log(tmp_path / "drive", "can0"), 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("topics", "reason"),
+    [
+        ({"soilbus.Window": [b"{}"]}, "it has no CAN frames: no JSON message of schema can_msgs/Frame"),
+        ({"can_msgs/Frame": [b'{"dlc": 1}']}, "a frame without 'header'"),
+        ({"can_msgs/Frame": [b"[" * 100_000]}, "a frame of more than 65536 characters"),
+        ({"other": [bytes(70 << 20)]}, "a block of more than 64 MiB"),
+        ({"other": [bytes(1 << 22)] * 20}, "it unpacks to more than 250 times its size"),
+    ],
+)
+def test_an_mcap_that_cannot_be_read_has_its_reason(
+    topics: dict[str, list[bytes]], reason: str, tmp_path: Path
+) -> None:
+    mcap_of(tmp_path / "drive.mcap", topics, CompressionType.ZSTD)
+    with pytest.raises(LogError, match=reason):
+        list(Log(tmp_path / "drive.mcap").frames())
+
+
 def test_an_mf4_of_decoded_signals_has_its_reason(tmp_path: Path) -> None:
     path = tmp_path / "decoded.mf4"
     stamps = np.arange(0.0, 2.0, 0.01)
@@ -172,7 +218,8 @@ def test_an_mf4_of_decoded_signals_has_its_reason(tmp_path: Path) -> None:
     with pytest.raises(LogError) as fault:
         list(Log(path).frames())
     assert str(fault.value) == (
-        f"{path}: not a CAN log that can be read (it has no CAN frames: decoded signals, perhaps)"
+        f"{path}: not a CAN log that can be read (it has no CAN frames; if it holds decoded signals, soilbus init"
+        " --table maps them)"
     )
 
 

@@ -388,8 +388,8 @@ def test_what_cannot_be_checked_is_a_fault(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
         checked_messages(c, load_databases(c))
     assert error.value.faults == [
-        "dbc.checked: no message Moto in the DBC; did you mean Motor?",
         "dbc.checked: Motor has no Counter and byte-aligned 8-bit Checksum",
+        "dbc.checked: no message Moto in the DBC; did you mean Motor?",
     ]
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from soilbus.can.admission import Admission
-from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.mapping import channels_of
 from soilbus.config.file import parse_config
 from soilbus.config.model import ConfigError
 

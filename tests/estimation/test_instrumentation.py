@@ -13,7 +13,7 @@ import pytest
 
 import shaking
 from soilbus.can.channels import Column, Decoded
-from soilbus.can.mapping import load_databases
+from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import found_configuration, load_config, parse_config
 from soilbus.config.model import Axle, Signal
 from soilbus.estimation.assembly import model_of, prior_of, rig_of

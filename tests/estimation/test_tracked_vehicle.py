@@ -15,7 +15,7 @@ import pytest
 from scipy.optimize import brentq
 
 from soilbus.can.channels import Column, Decoded
-from soilbus.can.mapping import load_databases
+from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config
 from soilbus.config.model import ConfigError
 from soilbus.decision.balance import Duty, balance

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from soilbus.can.dbc_files import load_databases
@@ -25,10 +27,15 @@ def config() -> Config:
 
 
 @pytest.fixture(scope="session")
-def windows(config, tmp_path_factory) -> list[WindowResult]:
+def log(config, tmp_path_factory) -> Path:
     way = course((-17.0, 179.9999), 60.0, None)
     log = tmp_path_factory.mktemp("drive") / "drive.log"
     write_log(frames(simulate(config, scenario_over(["loam"], 14.0, way), seed=3), config), log)
+    return log
+
+
+@pytest.fixture(scope="session")
+def windows(config, log) -> list[WindowResult]:
     results = list(replay(Pipeline(config, load_databases(config)), [log]))
     assert [str(r.status) for r in results] == ["valid"] * 4
     last = results[-1]

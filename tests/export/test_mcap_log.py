@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
 
 import jsonschema
 import pytest
 from mcap.reader import make_reader
 
+from soilbus.can.dbc_files import load_databases
 from soilbus.export.mcap_log import write_mcap
+from soilbus.offline.replay import read_frames, replay
 from soilbus.pipeline.outputs import json_line
+from soilbus.pipeline.pipeline import Pipeline
 
 TYPES = {"object", "array", "string", "number", "integer", "boolean"}
 
 
-@pytest.fixture
-def topics(windows, config, tmp_path) -> dict[str, list]:
-    write_mcap(tmp_path / "drive.mcap", windows, config)
+@pytest.fixture(scope="module")
+def mcap(windows, config, log, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("mcap") / "drive.mcap"
+    write_mcap(path, windows, config, [("can0", frame) for frame in read_frames(log)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def topics(mcap) -> dict[str, list]:
     found = defaultdict(list)
-    with (tmp_path / "drive.mcap").open("rb") as file:
+    validators = {}
+    with mcap.open("rb") as file:
         for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            if schema.id not in validators:
+                validators[schema.id] = jsonschema.Draft202012Validator(json.loads(schema.data))
+                validators[schema.id].check_schema(json.loads(schema.data))
             content = json.loads(message.data, parse_constant=pytest.fail)
-            jsonschema.validate(content, json.loads(schema.data), jsonschema.Draft202012Validator)
+            validators[schema.id].validate(content)
             found[channel.topic].append((schema, message, content))
     return found
 
@@ -73,6 +89,23 @@ def test_a_warning_stands_where_it_began(topics, windows):
     assert schema.name == "foxglove.Log"
     assert message.log_time == pytest.approx(windows[-1].warnings.begun[0] * 1e9, abs=200)
     assert "immobilisation" in content["message"]
+
+
+def test_frames_are_those_of_the_log(topics, log):
+    ((_, channel),) = {(schema.name, content["header"]["frame_id"]) for schema, _, content in topics["/can"]}
+    assert channel == "can0"
+    said = [(content["id"], bytes(content["data"])) for _, _, content in topics["/can"]]
+    assert said == [(identifier, bytes(data)) for _, identifier, _, data, _, _ in read_frames(log)]
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress])
+def test_the_file_replays_to_the_same_windows(mcap, windows, config, tmp_path, pack):
+    path = tmp_path / "again"
+    path.write_bytes(pack(mcap.read_bytes()))
+    again = list(replay(Pipeline(config, load_databases(config)), [path]))
+    assert [json_line(replace(w, log=""), config) for w in again] == [
+        json_line(replace(w, log=""), config) for w in windows[:-1]
+    ]
 
 
 def test_messages_are_in_the_order_of_their_times(windows, config, tmp_path):

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.can.mapping import load_databases
+from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
 from soilbus.offline.replay import fed

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from soilbus.can.checksum import frame_checksum
+from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
-from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.mapping import channels_of
 from soilbus.config.file import load_config, parse_config
 from soilbus.simulator.frames import START_TIME, encoded, frames
 from soilbus.simulator.recording import simulate

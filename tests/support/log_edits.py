@@ -31,10 +31,10 @@ class Stream:
 
     def signal(self, name: str) -> Array:
         """Physical values (N,)."""
-        return np.asarray(ColumnDecoder(self.message, [name]).decode(self.payload)[name], float)
+        return np.asarray(ColumnDecoder(self.message, [name]).columns(self.payload)[name].physical, float)
 
     def raw(self, name: str) -> NDArray[np.int64]:
-        return np.asarray(ColumnDecoder(self.message, [name]).raw(self.payload)[name], np.int64)
+        return np.asarray(ColumnDecoder(self.message, [name]).columns(self.payload)[name].raw, np.int64)
 
     def before(self, t: float) -> Stream:
         """The frames before t [s]."""

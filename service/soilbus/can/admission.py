@@ -16,7 +16,6 @@ import numpy as np
 from cantools.database.can import Database, Message
 from numpy.typing import NDArray
 
-from soilbus.arrays import Mask
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
 from soilbus.can.inbox import (
@@ -229,12 +228,7 @@ class Admission:
                 out.columns[channel.name] = Column(_NONE, _NONE)
             return
         self.counts.admitted[inbox.message.name] += len(batch.t)
-        blocks = batch.blocks(inbox.decoder)
-        plain = inbox.plain.samples(blocks) if inbox.plain is not None else None
-        if plain is not None:
-            out.columns.update((name, Column(batch.t, value)) for name, value in plain.items())
-            return
-        columns = inbox.decoder.columns_of(blocks)
+        columns = batch.columns(inbox.decoder)
         for channel, rule in zip(inbox.channels, inbox.rules, strict=True):
             _judge(channel, rule, inbox.message, batch.t, columns, out)
 
@@ -258,7 +252,7 @@ class Admission:
         if good is not frames:
             times, ids, datas = zip(*good, strict=True)
         payload = np.frombuffer(b"".join(datas), dtype=np.uint8).reshape(-1, length)
-        batch: Batch | None = Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
+        batch = Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
         for check, reason in (
             (checksum_right, Reason.BAD_CHECKSUM),
             (time_forward, Reason.TIME_BACKWARDS),
@@ -266,22 +260,14 @@ class Admission:
             (of_one_sender, Reason.SECOND_SENDER),
             (not_twice, Reason.DUPLICATE),
         ):
-            batch = self._passed(inbox, batch, check, reason, out)
+            mask = check(inbox, batch)
+            if mask is None or mask.all():
+                continue
+            self._refuse(inbox, batch.t[~mask], reason, out)
+            if not mask.any():
+                return None
+            batch = batch.where(mask)
         return batch
-
-    def _passed(
-        self,
-        inbox: Inbox,
-        batch: Batch | None,
-        check: Callable[[Inbox, Batch], Mask | None],
-        reason: Reason,
-        out: Decoded,
-    ) -> Batch | None:
-        mask = check(inbox, batch) if batch is not None else None
-        if batch is None or mask is None or mask.all():
-            return batch
-        self._refuse(inbox, batch.t[~mask], reason, out)
-        return batch.where(mask) if mask.any() else None
 
     def _refuse(self, inbox: Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
         self.counts.refused[inbox.message.name, reason] += len(t)

@@ -16,10 +16,11 @@ from typing import Any
 
 import can
 
+from soilbus.can import candump
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
 from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
-from soilbus.can.wire import MessageBus, Received, Wire, error_number, is_multicast, wire_of
+from soilbus.can.wire import MessageBus, MessageWire, Received, error_number, is_multicast, wire_of
 from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
@@ -76,8 +77,8 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
     return BusError(f"bus {name}: {one_line(error)}", may_come=is_there)
 
 
-def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[float, int, bool, bytes, bool, bool]]:
-    """Yield the frames that the bus carries from now on, as `candump.Frame`; nothing is sent.
+def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[candump.Frame]:
+    """Yield the frames that the bus carries from now on; nothing is sent.
 
     Raises BusError for a bus that cannot be opened or goes away.
     """
@@ -91,10 +92,7 @@ def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[flo
                 name = f"{settings.get('interface')}:{settings.get('channel')}"
                 raise BusError(f"bus {name}: {one_line(error)}", may_come=True) from None
             if message is not None:
-                yield (
-                    message.timestamp, message.arbitration_id, message.is_extended_id, bytes(message.data),
-                    message.is_remote_frame, message.is_error_frame,
-                )  # fmt: skip
+                yield candump.frame_of(message)
     finally:
         bus.shutdown()
 
@@ -164,7 +162,7 @@ class LiveBus:
         """Whether the last `receive` returned None because no frame of any kind waited."""
         self._opener, self._clock, self._sleep, self._own = opener, clock, sleep, frozenset(own)
         self._counts = BusCounts()
-        self._wire: Wire | None = None
+        self._wire: MessageWire | None = None
         self._outbox = Outbox()
         self._overruns_before = 0  # of wires that are closed, and what the controller reported
         self._refused_while_away = 0

@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
-from itertools import chain, islice, repeat
+from itertools import islice, repeat
 from operator import index
 
 import can
@@ -119,17 +119,12 @@ def _seconds(found: re.Match[str]) -> str:
     return f"{int(day.timestamp())}.{part or '0'}"
 
 
-def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
-    """Return the frames of a log's lines, the same that `can.CanutilsLogReader` reads.
+def candump_batches(lines: Iterable[str]) -> Iterator[Batch]:
+    """Yield the frames of a log's lines in lists, with their channels; the same that `can.CanutilsLogReader` reads.
 
     Raises what the reader (ValueError, IndexError) or `lines` raises, or ValueError for half a byte,
     after the frames before that place.
     """
-    return chain.from_iterable(frames for _, frames in candump_batches(lines))
-
-
-def candump_batches(lines: Iterable[str]) -> Iterator[Batch]:
-    """Yield the frames of `candump_frames` in lists, with their channels."""
     for batch in _batches(iter(lines)):
         plain = _plain(_DIRECTION.sub("\n", "".join(batch)))
         if plain is None:

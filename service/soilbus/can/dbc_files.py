@@ -45,18 +45,14 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
     names = _mapped(config) if mapped_only else None
     for name in config.dbc.input:
         try:
-            for message in _read(located(config.folder, name), names).messages:
-                first, known = messages.setdefault(message.name, (name, message))
-                if not _same(known, message):
-                    faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
-        except FileNotFoundError as error:
-            faults.append(
-                f"dbc.input: {name}: {error.strerror or error}{did_you_mean(name, _dbc_names(config.folder))}"
-            )
-        except OSError as error:
-            faults.append(f"dbc.input: {name}: {error.strerror or error}")
-        except Exception as error:  # the parser raises all kinds on a text that is no DBC
-            faults.append(f"dbc.input: {name}: not a DBC file: {one_line(error)}")
+            read = _read_named("dbc.input", config.folder, name, names)
+        except ConfigError as error:
+            faults += error.faults
+            continue
+        for message in read.messages:
+            first, known = messages.setdefault(message.name, (name, message))
+            if _layout(known) != _layout(message):
+                faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
     if faults:
         raise ConfigError(faults)
     if names is not None and not names <= messages.keys():
@@ -85,19 +81,13 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
     """
     ours = [path for name in config.dbc.input if _is_shipped(path := located(config.folder, name))]
     found = {m.name for path in ours for m in _read(path).messages if checkable_byte(m) is not None}
-    if not config.dbc.checked:
-        return frozenset(found)
     known = {m.name: m for m in database.messages}
-    faults = [
-        f"dbc.checked: no message {name} in the DBC{did_you_mean(name, known)}"
-        for name in config.dbc.checked
-        if name not in known
-    ]
-    faults += [
-        f"dbc.checked: {name} has no {COUNTER} and byte-aligned 8-bit {CHECKSUM}"
-        for name in config.dbc.checked
-        if name in known and checkable_byte(known[name]) is None
-    ]
+    faults = []
+    for name in config.dbc.checked:
+        if name not in known:
+            faults.append(f"dbc.checked: no message {name} in the DBC{did_you_mean(name, known)}")
+        elif checkable_byte(known[name]) is None:
+            faults.append(f"dbc.checked: {name} has no {COUNTER} and byte-aligned 8-bit {CHECKSUM}")
     if faults:
         raise ConfigError(faults)
     return frozenset(found | set(config.dbc.checked))
@@ -109,13 +99,8 @@ def output_database(config: Config) -> Database:
     Raises ConfigError where it is missing, not a DBC, or lacks anything of a message of ours.
     """
     name = config.output.dbc
-    try:
-        database = _read(located(config.folder, name))
-        ours = {m.name: m for m in _read(shipped_dbc("soilbus.dbc")).messages}
-    except OSError as error:
-        raise ConfigError([f"output.dbc: {name}: {error.strerror or error}"]) from None
-    except Exception as error:
-        raise ConfigError([f"output.dbc: {name}: not a DBC file: {one_line(error)}"]) from None
+    database = _read_named("output.dbc", config.folder, name)
+    ours = {m.name: m for m in _read(shipped_dbc("soilbus.dbc")).messages}
     missing = sorted(ours.keys() - {m.name for m in database.messages})
     if missing:
         raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
@@ -152,10 +137,18 @@ def filters_of(database: Database) -> list[dict[str, Any]]:
     return [{"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages]
 
 
-def _dbc_names(folder: Path) -> set[str]:
-    """Names of the DBC files beside a configuration, and of ours."""
-    folders = (folder, *DBC_FOLDERS)
-    return {path.name for place in folders for path in place.glob("*.dbc")}
+def _read_named(key: str, folder: Path, name: str, names: set[str] | None = None) -> Database:
+    """`_read` of a DBC that the configuration names; ConfigError with the key where it cannot be read."""
+    try:
+        return _read(located(folder, name), names)
+    except FileNotFoundError as error:
+        there = {path.name for place in (folder, *DBC_FOLDERS) for path in place.glob("*.dbc")}
+        why = f"{error.strerror or error}{did_you_mean(name, there)}"
+    except OSError as error:
+        why = error.strerror or str(error)
+    except Exception as error:  # the parser raises all kinds on a text that is no DBC
+        why = f"not a DBC file: {one_line(error)}"
+    raise ConfigError([f"{key}: {name}: {why}"])
 
 
 def _is_shipped(path: Path) -> bool:
@@ -211,10 +204,6 @@ def _database(messages: Iterable[Message]) -> Database:
         database.messages.append(message)
     database.refresh()
     return database
-
-
-def _same(a: Message, b: Message) -> bool:
-    return _layout(a) == _layout(b)
 
 
 def _layout(message: Message) -> tuple[object, ...]:

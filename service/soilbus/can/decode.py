@@ -1,16 +1,13 @@
-"""DBC -> column plan: a whole window of frames decoded at once.
+"""A message's signals decoded as columns, a whole window of frames at once.
 
-Every value equals that of `cantools.database.can.Message.decode(..., decode_choices=False)`,
-bit for bit.  For the fifty frames of a hop the cost is the number of numpy calls, not the number
-of bytes.  So signals of one sign and kind of conversion are cut out together: those that fill
-aligned 1, 2 or 4 bytes by looking at the payload as numbers of that size (lanes), others that
-share the same eight bytes by two shifts for all of them.
+    payload (N, length) -> eight bytes as one word (N,) -> raw codes (N,) -> physical values (N,)
+
+Every value equals that of `cantools.database.can.Message.decode(..., decode_choices=False)`, bit for bit.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -25,18 +22,11 @@ from cantools.database.conversion import (
 )
 from numpy.typing import NDArray
 
-from soilbus.can.bits import Place, place_of, top_aligned
-
-Kind = Literal["identity", "integer", "linear", "row"]
 Payload = NDArray[np.uint8]
-Block = tuple[NDArray[Any], NDArray[Any]]
-"""Codes and physical values (rows, N) of signals that were cut out together."""
 
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 _FLOAT_BITS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
 _EXACT_FLOAT = 2**53
-_INT64 = np.dtype(np.int64)
-_FLOAT64 = np.dtype(np.float64)
 _LIMITS = np.iinfo(np.int64)
 
 
@@ -54,29 +44,6 @@ class SignalColumn(NamedTuple):
     present: NDArray[np.bool_] | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Group:
-    """Signals cut out and scaled together.
-
-    `lane` is the number type that the payload is looked at as, None where bits are shifted out
-    of the word at `place`.  `rows` tells which row of the result is whose; `left`, `right`,
-    `scale` and `offset` are (rows, 1), the last two plain numbers where all rows share them.
-    `right` is int64 for signed signals, else uint64, so that the shift keeps the sign.
-    """
-
-    signals: tuple[Signal, ...]
-    rows: tuple[tuple[str, int], ...]
-    place: Place
-    lane: np.dtype[Any] | None
-    signed: bool
-    kind: Kind
-    left: NDArray[np.uint64]
-    right: NDArray[Any]
-    scale: Any
-    offset: Any
-    adds_offset: bool
-
-
 class ColumnDecoder:
     """Decoder of the named signals of one message, and of the multiplexers they hang on.
 
@@ -86,12 +53,7 @@ class ColumnDecoder:
 
     def __init__(self, message: Message, signals: Sequence[str]) -> None:
         self.message = message
-        self._length = message.length
-        self.signals = tuple(dict.fromkeys(signals))
-        wanted = _with_multiplexers(message, self.signals)
-        self._multiplexed = tuple(s for s in wanted.values() if s.multiplexer_signal is not None)
-        self._groups = _groups(message.length, list(wanted.values()))
-        self.rows = tuple(group.rows for group in self._groups)
+        self._plans = [_plan(message, signal) for signal in _with_multiplexers(message, signals)]
 
     def columns(self, payload: Payload) -> dict[str, SignalColumn]:
         """Return the raw codes, physical values and presence by signal name; payload (N, message length).
@@ -99,42 +61,19 @@ class ColumnDecoder:
         Signals that the wanted ones hang on are among them.  Raises ValueError when the payload
         has another shape or is not bytes.
         """
-        return self.columns_of(self.blocks(payload))
-
-    def blocks(self, payload: Payload) -> list[Block]:
-        """Return everything decoded, block by block; `rows` names each block's rows.  Errors as `columns`."""
-        if payload.ndim != 2 or payload.shape[1] != self._length or payload.dtype != np.uint8:
-            expected = f"uint8 (N, {self._length})"
+        length = self.message.length
+        if payload.ndim != 2 or payload.shape[1] != length or payload.dtype != np.uint8:
+            expected = f"uint8 (N, {length})"
             raise ValueError(f"{self.message.name}: payload is {payload.dtype} {payload.shape}, not {expected}")
-        codes = [_codes(group, payload) for group in self._groups]
-        return [(c, _scaled(group, c)) for group, c in zip(self._groups, codes, strict=True)]
-
-    def columns_of(self, blocks: Sequence[Block]) -> dict[str, SignalColumn]:
-        """Return the columns that `blocks` holds; see `columns`."""
+        words: dict[_Place, NDArray[np.uint64]] = {}
         columns: dict[str, SignalColumn] = {}
-        for rows, (codes, values) in zip(self.rows, blocks, strict=True):
-            for name, row in rows:
-                columns[name] = SignalColumn(codes[row], values[row], None)
-        for signal in self._multiplexed:
-            columns[signal.name] = columns[signal.name]._replace(present=_presence(signal, columns))
+        with np.errstate(over="ignore", invalid="ignore"):  # a signalling nan is still only a nan
+            for plan in self._plans:
+                if plan.place not in words:
+                    words[plan.place] = _words(payload, plan.place)
+                raw = _codes(plan, words[plan.place])
+                columns[plan.signal.name] = SignalColumn(raw, _scaled(plan, raw), _presence(plan.signal, columns))
         return columns
-
-    def raw(self, payload: Payload) -> dict[str, NDArray[Any]]:
-        """Return the raw codes (N,) by signal name; see `columns`."""
-        columns = self.columns(payload)
-        return {name: columns[name].raw for name in self.signals}
-
-    def decode(self, payload: Payload) -> dict[str, NDArray[Any]]:
-        """Return the physical values (N,) by signal name; see `columns`, and `present` for multiplexed signals."""
-        columns = self.columns(payload)
-        return {name: columns[name].physical for name in self.signals}
-
-    def present(self, payload: Payload) -> dict[str, NDArray[np.bool_]]:
-        """Return whether each frame carries each signal, (N,) by signal name."""
-        everywhere = np.ones(len(payload), dtype=np.bool_)
-        columns = self.columns(payload)
-        masks = {name: columns[name].present for name in self.signals}
-        return {name: everywhere if mask is None else mask for name, mask in masks.items()}
 
 
 def code_limits(signal: Signal) -> tuple[int, int]:
@@ -156,12 +95,12 @@ def check_decodable(message: Message, name: str) -> Signal:
         raise ValueError(f"{message.name}.{name} is longer than 64 bits")
     if signal.conversion.is_float and signal.length not in _FLOATS:
         raise ValueError(f"{message.name}.{name} is a float of {signal.length} bits")
-    place_of(signal.start, signal.length, signal.byte_order == "big_endian", message.length)
+    _place_of(signal, message.length)
     return signal
 
 
-def _with_multiplexers(message: Message, names: Sequence[str]) -> dict[str, Signal]:
-    """Signals by name, each after the multiplexer that it hangs on."""
+def _with_multiplexers(message: Message, names: Sequence[str]) -> list[Signal]:
+    """Signals, each once and after the multiplexer that it hangs on."""
     ordered: dict[str, Signal] = {}
 
     def add(name: str) -> None:
@@ -173,155 +112,128 @@ def _with_multiplexers(message: Message, names: Sequence[str]) -> dict[str, Sign
     for name in names:
         if name not in ordered:
             add(name)
-    return ordered
+    return list(ordered.values())
 
 
-def _presence(signal: Signal, columns: dict[str, SignalColumn]) -> NDArray[np.bool_]:
+def _presence(signal: Signal, columns: Mapping[str, SignalColumn]) -> NDArray[np.bool_] | None:
     """Where the multiplexer of a signal selects it; the multiplexer's own presence is known already."""
-    above = columns[str(signal.multiplexer_signal)]
+    if signal.multiplexer_signal is None:
+        return None
+    above = columns[signal.multiplexer_signal]
     mask: NDArray[np.bool_] = np.isin(above.physical, list(signal.multiplexer_ids or ()))
     return mask if above.present is None else mask & above.present
 
 
-def _groups(length: int, signals: list[Signal]) -> list[_Group]:
-    """The signals in groups; of several in the same lane (multiplexed ones) each in another group, with its scale."""
-    sorted_in: dict[tuple[Any, ...], list[Signal]] = {}
-    in_lane: Counter[tuple[Any, ...]] = Counter()
-    for signal in signals:
-        place, _ = _place(signal, length)
-        is_float = bool(signal.conversion.is_float)
-        kind: Kind = "row" if is_float else _kind(signal)
-        if kind == "row" or signal.length == 64:
-            key: tuple[Any, ...] = (signal.name,)
-        elif _lane(signal, length) is not None:
-            lanes = signal.length, signal.byte_order, signal.is_signed, kind
-            key = (*lanes, in_lane[*lanes, signal.start])
-            in_lane[*lanes, signal.start] += 1
-        else:
-            key = (place, signal.is_signed, kind)
-        sorted_in.setdefault(key, []).append(signal)
-    return [_group(length, members) for members in sorted_in.values()]
+# --- bits ---
 
 
-def _group(length: int, members: list[Signal]) -> _Group:
-    first = members[0]
-    is_float = bool(first.conversion.is_float)
-    kind: Kind = "row" if is_float else _kind(first)
-    number = np.float64 if kind == "linear" else np.int64 if kind == "integer" else np.object_
-    lane = None if kind == "row" or first.length == 64 else _lane(first, length)
-    size = first.length // 8
-    count = len(members) if lane is None else length // size
-    rows = [(s.name, i if lane is None else s.start // 8 // size) for i, s in enumerate(members)]
-    conversions = [_plain(signal) for signal in members]
-    # lanes that nobody asked for are scaled like the first
-    scale = np.full((count, 1), conversions[0].scale, dtype=number)
-    offset = np.full((count, 1), conversions[0].offset, dtype=number)
-    for (_, row), conversion in zip(rows, conversions, strict=True):
-        scale[row], offset[row] = conversion.scale, conversion.offset
-    signed = first.is_signed and not is_float
-    return _Group(
-        signals=tuple(members),
-        rows=tuple(rows),
-        place=_place(first, length)[0],
-        lane=lane,
-        signed=signed,
-        kind=kind,
-        left=_stacked([_place(s, length)[1] for s in members], np.uint64),
-        right=_stacked([64 - s.length for s in members], np.int64 if signed else np.uint64),
-        scale=shared(scale),
-        offset=shared(offset),
-        # adding zero matters only for minus zero, which a positive scale cannot give
-        adds_offset=any(c.offset != 0 or c.scale <= 0 for c in conversions),
-    )
+class _Place(NamedTuple):
+    """Eight bytes from `first` on, as one number; `spill` is the count of leading bits to skip.
+
+    spill > 0 only where a signal touches nine bytes, so that no eight hold it.
+    """
+
+    first: int
+    is_big_endian: bool
+    spill: int
 
 
-def _place(signal: Signal, length: int) -> tuple[Place, int]:
-    return place_of(signal.start, signal.length, signal.byte_order == "big_endian", length)
+def _place_of(signal: Signal, message_length: int) -> tuple[_Place, int]:
+    """The word that holds a signal, and the left shift that brings its top bit to bit 63.
+
+    `start` of a DBC is the signal's least significant bit (little endian) or its most significant (big endian), bit 0
+    of a byte being the least significant.  Raises ValueError when the signal does not lie within the message.
+    """
+    start, length, is_big_endian = signal.start, signal.length, signal.byte_order == "big_endian"
+    first_bit = 8 * (start // 8) + (7 - start % 8) if is_big_endian else start
+    if not (1 <= length <= 64 and first_bit >= 0 and first_bit + length <= 8 * message_length):
+        raise ValueError(f"{length} bits from {start} do not lie within {message_length} bytes")
+    byte, skip = divmod(first_bit, 8)
+    if skip + length > 64:
+        return _Place(byte, is_big_endian, skip), 0 if is_big_endian else 64 - length
+    first = max(min(byte, message_length - 8), 0)
+    inside = first_bit - 8 * first
+    return _Place(first, is_big_endian, 0), inside if is_big_endian else 64 - length - inside
 
 
-def _lane(signal: Signal, length: int) -> np.dtype[Any] | None:
-    """Number type of a signal that fills aligned bytes of a message, None for others."""
-    size, big_endian = signal.length // 8, signal.byte_order == "big_endian"
-    aligned = signal.length in (8, 16, 32) and signal.start % 8 == (7 if big_endian else 0)
-    if not aligned or signal.start // 8 % size or length % size:
-        return None
-    return np.dtype(f"{'>' if big_endian else '<'}{'i' if signal.is_signed else 'u'}{size}")
+def _words(payload: Payload, place: _Place) -> NDArray[np.uint64]:
+    """The word of a place in every row of a payload (N, length), as (N,)."""
+    block = payload[:, place.first : place.first + 8]
+    if block.shape[1] < 8:
+        block = np.concatenate([block, np.zeros((len(block), 8 - block.shape[1]), np.uint8)], axis=1)
+    words: NDArray[np.uint64] = np.ascontiguousarray(block).view(">u8" if place.is_big_endian else "<u8")[:, 0]
+    if not place.spill:
+        return words
+    ninth = payload[:, place.first + 8].astype(np.uint64)
+    if place.is_big_endian:
+        return (words << np.uint64(place.spill)) | (ninth >> np.uint64(8 - place.spill))
+    return (words >> np.uint64(place.spill)) | (ninth << np.uint64(64 - place.spill))
 
 
-def shared(column: NDArray[Any]) -> Any:
-    """Return the number that all rows share, else the column itself."""
-    return column[0, 0] if (column == column[0, 0]).all() else column
+# --- values ---
 
 
-def _stacked(values: Sequence[Any], dtype: Any) -> NDArray[Any]:
-    return np.array(values, dtype=dtype).reshape(-1, 1)
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """How a signal is cut out of a word and scaled.
+
+    `right` is int64 for a signed signal, else uint64, so that the shift keeps the sign; `kind` is "python" where 64
+    bits cannot follow Python's integers.
+    """
+
+    signal: Signal
+    place: _Place
+    left: np.uint64
+    right: np.int64 | np.uint64
+    conversion: BaseConversion
+    kind: Literal["identity", "integer", "linear", "python"]
 
 
-def _plain(signal: Signal) -> BaseConversion:
-    """The conversion that remains when value names are not asked for."""
+def _plan(message: Message, signal: Signal) -> _Plan:
+    place, left = _place_of(signal, message.length)
     conversion = signal.conversion
-    if isinstance(conversion, NamedSignalConversion):
-        return BaseConversion.factory(conversion.scale, conversion.offset, None, conversion.is_float)
-    return conversion
+    if isinstance(conversion, NamedSignalConversion):  # nobody asks for the names
+        conversion = BaseConversion.factory(conversion.scale, conversion.offset, None, conversion.is_float)
+    is_signed = signal.is_signed and not conversion.is_float
+    right = (np.int64 if is_signed else np.uint64)(64 - signal.length)
+    return _Plan(signal, place, np.uint64(left), right, conversion, _kind(signal, conversion))
 
 
-def _kind(signal: Signal) -> Kind:
-    """How an integer signal is scaled; "row" where 64 bits cannot follow Python's integers."""
-    conversion = _plain(signal)
+def _kind(signal: Signal, conversion: BaseConversion) -> Literal["identity", "integer", "linear", "python"]:
     if isinstance(conversion, IdentityConversion):
         return "identity"
+    if conversion.is_float:
+        return "linear" if isinstance(conversion, LinearConversion) else "python"
     low, high = code_limits(signal)
     products = [low * conversion.scale, high * conversion.scale]
     if isinstance(conversion, LinearIntegerConversion):
         numbers = [high, *products, *(p + conversion.offset for p in products), conversion.scale, conversion.offset]
-        return "integer" if all(_LIMITS.min <= n <= _LIMITS.max for n in numbers) else "row"
-    if isinstance(conversion, LinearConversion):
-        exact = isinstance(conversion.scale, int) and max(abs(p) for p in products) > _EXACT_FLOAT
-        return "row" if exact else "linear"
-    return "row"
+        return "integer" if all(_LIMITS.min <= n <= _LIMITS.max for n in numbers) else "python"
+    is_rounded = isinstance(conversion.scale, int) and max(abs(p) for p in products) > _EXACT_FLOAT
+    return "linear" if isinstance(conversion, LinearConversion) and not is_rounded else "python"
 
 
-def _codes(group: _Group, payload: Payload) -> NDArray[Any]:
-    """Raw codes (rows, N) of a group."""
-    if group.lane is not None:
-        lanes: NDArray[np.int64] = np.ascontiguousarray(payload).view(group.lane).T.astype(_INT64, order="C")
-        return lanes
-    top = top_aligned(payload, group.place) << group.left
-    if group.signed:
-        signed: NDArray[np.int64] = top.view(_INT64) >> group.right
+def _codes(plan: _Plan, words: NDArray[np.uint64]) -> NDArray[Any]:
+    """Raw codes (N,) of a signal."""
+    top = words << plan.left
+    if isinstance(plan.right, np.int64):
+        signed: NDArray[np.int64] = top.view(np.int64) >> plan.right
         return signed
-    codes: NDArray[np.uint64] = top >> group.right
-    first = group.signals[0]
-    if first.conversion.is_float:
-        bits = codes.astype(_FLOAT_BITS[first.length])
-        with np.errstate(invalid="ignore"):  # a signalling nan is still only a nan
-            return bits.view(_FLOATS[first.length]).astype(np.float64)
-    return codes if first.length == 64 else codes.view(_INT64)
+    codes: NDArray[np.uint64] = top >> plan.right
+    length = plan.signal.length
+    if plan.conversion.is_float:
+        return codes.astype(_FLOAT_BITS[length]).view(_FLOATS[length]).astype(np.float64)
+    return codes if length == 64 else codes.view(np.int64)
 
 
-def _scaled(group: _Group, codes: NDArray[Any]) -> NDArray[Any]:
-    """Physical values (rows, N) of a group."""
-    if group.kind == "identity":
+def _scaled(plan: _Plan, codes: NDArray[Any]) -> NDArray[Any]:
+    """Physical values (N,) of a signal."""
+    conversion = plan.conversion
+    if plan.kind == "identity":
         return codes
-    if group.kind == "row":
-        return _scaled_by_row(group.signals[0], codes)
-    values: NDArray[Any] = codes.astype(_FLOAT64) if group.kind == "linear" else codes.copy()
-    values *= group.scale
-    if group.adds_offset:
-        values += group.offset
-    return values
-
-
-def _scaled_by_row(signal: Signal, codes: NDArray[Any]) -> NDArray[Any]:
-    """Python's own arithmetic, value by value: for floats' and integers' rare conversions."""
-    conversion = _plain(signal)
-    if isinstance(conversion, IdentityConversion):
-        return codes
-    if signal.conversion.is_float and isinstance(conversion, LinearConversion):
-        with np.errstate(over="ignore", invalid="ignore"):
-            scaled: NDArray[np.float64] = codes * float(conversion.scale) + float(conversion.offset)
-        return scaled
-    values = [conversion.raw_to_scaled(code, False) for code in codes[0].tolist()]
-    dtype = np.float64 if isinstance(conversion, LinearConversion) else np.object_
-    out: NDArray[Any] = np.array([values], dtype=dtype)
-    return out
+    if plan.kind == "python":
+        values = [conversion.raw_to_scaled(code, False) for code in codes.tolist()]
+        return np.array(values, np.float64 if isinstance(conversion, LinearConversion) else np.object_)
+    if plan.kind == "integer":
+        return codes * np.int64(conversion.scale) + np.int64(conversion.offset)
+    return codes.astype(np.float64) * float(conversion.scale) + float(conversion.offset)

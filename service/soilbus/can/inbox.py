@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from soilbus.arrays import Mask
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
-from soilbus.can.decode import Block, ColumnDecoder
+from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
-from soilbus.can.plain import PlainPlan, plain_plan
 from soilbus.can.validity import CodeRule, rule_of
 
 TWICE = 0.002
@@ -40,13 +39,13 @@ class Batch:
     t: NDArray[np.float64]
     ids: NDArray[np.int64]
     payload: NDArray[np.uint8]
-    _blocks: list[Block] | None = None
+    _columns: dict[str, SignalColumn] | None = None
 
-    def blocks(self, decoder: ColumnDecoder) -> list[Block]:
+    def columns(self, decoder: ColumnDecoder) -> dict[str, SignalColumn]:
         """Return the payload as the message's decoder decodes it."""
-        if self._blocks is None:
-            self._blocks = decoder.blocks(self.payload)
-        return self._blocks
+        if self._columns is None:
+            self._columns = decoder.columns(self.payload)
+        return self._columns
 
     def where(self, mask: Mask) -> Batch:
         """Return the frames of a mask (N,)."""
@@ -61,7 +60,6 @@ class Inbox:
     channels: tuple[Channel, ...]
     rules: tuple[CodeRule, ...]
     decoder: ColumnDecoder
-    plain: PlainPlan | None
     lock: SourceLock | None
     checksum_byte: int | None
     frames: list[Frame] = field(default_factory=list)
@@ -105,7 +103,6 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
         channels=tuple(channels),
         rules=rules,
         decoder=decoder,
-        plain=plain_plan(message, channels, rules, decoder),
         lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
         checksum_byte=place,
     )
@@ -121,40 +118,34 @@ def popped(inbox: Inbox, until: float) -> list[Frame]:
 
 
 def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where the payload does not give the Checksum; None where all do, or none is asked for."""
+    """Return False where the payload does not give the Checksum; None where none is asked for."""
     if inbox.checksum_byte is None:
         return None
-    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
-    right: Mask = batch.payload[:, inbox.checksum_byte] == due
-    return None if np.count_nonzero(right) == len(right) else right
+    right: Mask = batch.payload[:, inbox.checksum_byte] == column_checksums(
+        batch.ids, batch.payload, inbox.checksum_byte
+    )
+    return right
 
 
-def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where time goes back or is no number; None where it always goes on."""
-    t = batch.t
-    first, last = float(t[0]), float(t[-1])
-    rises = np.count_nonzero(t[1:] >= t[:-1]) == len(t) - 1  # never of a nan
-    if rises and first >= inbox.last_t and math.isfinite(first) and math.isfinite(last):
-        inbox.last_t = last
-        return None
-    mask = np.zeros(len(t), dtype=np.bool_)
-    for i, now in enumerate(t.tolist()):
-        if math.isfinite(now) and now >= inbox.last_t:
-            mask[i] = True
-            inbox.last_t = now
-    return mask
+def time_forward(inbox: Inbox, batch: Batch) -> Mask:
+    """Return False where time goes back or is no number."""
+    is_time = np.isfinite(batch.t)
+    t = np.where(is_time, batch.t, -math.inf)
+    newest = np.maximum.accumulate(np.concatenate([[inbox.last_t], t]))
+    inbox.last_t = float(newest[-1])
+    forward: Mask = is_time & (t >= newest[:-1])
+    return forward
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where a frame repeats the counter of its sender's last one; None where none does.
+    """Return False where a frame repeats the counter of its sender's last one; None where no counter is checked.
 
     What the counters skip is counted in `inbox.missed`; what cannot be trusted is kept for `of_one_sender`.
     """
     inbox.untrusted = None
     if inbox.checksum_byte is None:
         return None
-    column = inbox.decoder.columns_of(batch.blocks(inbox.decoder))[COUNTER]
-    counter = column.raw.astype(np.int64)
+    counter = batch.columns(inbox.decoder)[COUNTER].raw.astype(np.int64)
     modulus = 1 << inbox.message.get_signal_by_name(COUNTER).length
     step = np.diff(counter, prepend=inbox.last_counter) % modulus
     follows = np.diff(batch.ids, prepend=inbox.last_id) == 0
@@ -165,7 +156,7 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
     inbox.missed += int(np.maximum(step - 1, 0)[follows if untrusted is None else follows & ~untrusted].sum())
     if untrusted is not None:
         inbox.untrusted = untrusted[moved]
-    return None if moved.all() else moved
+    return moved
 
 
 def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mask) -> Mask | None:

@@ -28,12 +28,14 @@ from typing import NamedTuple
 import can
 
 from soilbus.can.candump import Batch, candump_batches, is_candump, of_message
+from soilbus.can.mcap_frames import frame_batches
 from soilbus.files import LIMITS, text_lines, within_ratio
 
 HEAD = 1 << 13
 """Bytes at the begin of a log by which its format is recognised."""
 WRAP = 1 << 32
 """Microseconds after which the stamps of an analyser of 32 bits begin again."""
+OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
 DAY = 86400.0
 """Seconds after which a clock of hours, minutes and seconds begins again."""
 
@@ -76,7 +78,7 @@ def format_of(head: bytes) -> Format:
     if "\0" in text or "\ufffd" in text:
         raise ValueError("binary data of no known format")
     if columns := [cell for cell in re.split("[,;\t]", first) if cell.strip()][1:]:
-        raise ValueError(f"a table, whose {len(columns) + 1} columns are not those of CAN frames")
+        raise ValueError(f"a table, whose {len(columns) + 1} columns are not those of CAN frames; {OF_SIGNALS}")
     raise ValueError("text of no known format")
 
 
@@ -89,8 +91,9 @@ _ASC_LINE = re.compile(
     re.IGNORECASE,
 )
 _TRC_LINE = re.compile(r"\d+\)\s+\d")
-_ASC_NO_FRAME = re.compile(r"\s*+[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s)")
-"""Events that python-can would take for frames: "Start of measurement" of CAN FD, requests to send."""
+_ASC_NO_FRAME = re.compile(r"\s*+(date\s|[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s))", re.IGNORECASE)
+"""Events that python-can would take for frames ("Start of measurement" of CAN FD, requests to send), and the date:
+in some languages python-can does not know it and reads no base after it."""
 RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
@@ -311,7 +314,7 @@ def _mf4(stream: BufferedReader) -> Iterator[Batch]:
                 is_empty = False
                 yield of_message(message)
         if is_empty:
-            raise ValueError("it has no CAN frames: decoded signals, perhaps")
+            raise ValueError(f"it has no CAN frames; {OF_SIGNALS}")
 
 
 def _mf4_reader(path: Path) -> can.MF4Reader:
@@ -345,6 +348,14 @@ def check_mf4_blocks(path: Path) -> None:
             within_ratio(size, plain)
 
 
+def _mcap(stream: BufferedReader) -> Iterator[Batch]:
+    try:
+        import mcap  # noqa: F401
+    except ModuleNotFoundError:
+        raise MissingExtraError("this format needs soilbus[mcap]") from None
+    return frame_batches(stream)
+
+
 _SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages"
 
 
@@ -373,10 +384,10 @@ def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
 _BINARY = {
     b"LOGG": Format("BLF log", _blf),
     b"MDF     4": Format("MF4 log", _mf4),
+    b"\x89MCAP": Format("MCAP log", _mcap),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
 }
 _NO_FRAMES = {
-    b"\x89MCAP": "an MCAP file, such as replay --mcap writes of its results",
     b"PAR1": "a Parquet table",
     b"UnFinMF ": "an MDF file that was never finished",
     b"MDF     ": "an MDF file of version 3",

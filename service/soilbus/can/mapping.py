@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from cantools.database.can import Database, Message, Signal
 
 from soilbus.can.channels import WHOLE, Channel
-from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
 from soilbus.can.validity import meaning, vouching_codes
@@ -64,10 +63,31 @@ _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
 _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
 
 
-_CURRENTS = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
-"""Ampere in units of a motor's current."""
-_PRESSURES = {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757}
-"""Pascal in units of an air spring's pressure."""
+class _Number(NamedTuple):
+    """What a number of the mapping makes of a signal in a unit that is not one of the role."""
+
+    roles: tuple[str, ...]
+    units: Mapping[str, float]
+    bare: str
+    """The unit of a signal without one."""
+    dimension: str
+    wanted: str
+    hint: str
+
+
+_TORQUES = ("torque", "torque_limit")
+_NUMBERS: Mapping[str, _Number] = {
+    "torque_constant": _Number(
+        _TORQUES, {"A": 1.0, "mA": 1e-3, "kA": 1e3}, "A", "torque",
+        "a current in A or mA", "a current: give its torque_constant [N m/A]",
+    ),
+    "reference_torque": _Number(_TORQUES, {"%": 0.01}, "no unit", "torque", "%", ""),
+    "effective_area": _Number(
+        ("load",), {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757},
+        "Pa", "force", "a pressure in Pa, kPa or bar", "a pressure: give effective_area [m^2]",
+    ),
+}  # fmt: skip
+"""By key of the mapping."""
 
 
 class _Fault(Exception):
@@ -105,25 +125,16 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
 
 def without_unit(channels: Iterable[Channel], database: Database) -> list[Channel]:
     """Return the channels whose signal has no unit, so that SI was assumed."""
-    return [c for c in channels if c.quantity != LOCK and _is_bare(_signal(c, database))]
+    return [c for c in channels if c.quantity != LOCK and _unit_said(found_signal(database, c.path)[1]) == ""]
 
 
-def _is_bare(signal: Signal) -> bool:
+def _unit_said(signal: Signal) -> str | None:
+    """The dimension of a signal's unit, "" without a unit; None for a unit that is none of ours, such as ampere."""
     try:
-        return unit_of(signal.unit) is None
-    except ValueError:  # ampere, per cent of a torque or a pressure
-        return False
-
-
-def _has_dimension(signal: Signal) -> bool:
-    try:
-        return unit_of(signal.unit) is not None
+        unit = unit_of(signal.unit)
     except ValueError:
-        return False
-
-
-def _signal(channel: Channel, database: Database) -> Signal:
-    return database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
+        return None
+    return unit.dimension if unit is not None else ""
 
 
 def _roles(config: Config) -> Iterator[_Role]:
@@ -259,21 +270,17 @@ def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
     fitting = _DIMENSIONS[quantity]
     if fitting == ("",):
         return _code(quantity, signal)
-    if mapped.torque_constant is not None:
-        return _current(quantity, signal, mapped.torque_constant)
-    if mapped.reference_torque is not None:
-        return _percentage(quantity, signal, mapped.reference_torque)
-    if mapped.effective_area is not None:
-        return _pressure(quantity, signal, mapped.effective_area)
+    for key in _NUMBERS:
+        if (number := getattr(mapped, key)) is not None:
+            return _by_number(quantity, signal, key, number)
     wanted = " or ".join(SI[dimension] for dimension in fitting)
     try:
         unit = unit_of(signal.unit)
     except ValueError as error:
         spelled = (signal.unit or "").strip()
-        if spelled in _CURRENTS and quantity in ("torque", "torque_limit"):
-            raise _Fault(f"{_called(signal)} is in {spelled}, a current: give its torque_constant [N m/A]") from None
-        if spelled in _PRESSURES and quantity == "load":
-            raise _Fault(f"{_called(signal)} is in {spelled}, a pressure: give effective_area [m^2]") from None
+        for rule in _NUMBERS.values():
+            if rule.hint and spelled in rule.units and quantity in rule.roles:
+                raise _Fault(f"{_called(signal)} is in {spelled}, {rule.hint}") from None
         raise _Fault(f"{_called(signal)}: {error} ({quantity} needs {wanted})") from None
     if unit is None:
         if quantity in POSITION_ROLES:
@@ -291,40 +298,20 @@ def _called(signal: Signal) -> str:
 
 def _code(quantity: str, signal: Signal) -> tuple[str, float]:
     """No dimension; a fault for a signal with a unit of one."""
-    if _has_dimension(signal):
+    if _unit_said(signal):
         raise _Fault(f"{_called(signal)} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
     return "", 1.0
 
 
-def _pressure(quantity: str, signal: Signal, area: float) -> tuple[str, float]:
-    """Force for a unit of the pressure in springs of this effective area [m^2]."""
-    if quantity != "load":
-        raise _Fault(f"effective_area has no meaning for {quantity}")
-    unit = _PRESSURES.get((signal.unit or "Pa").strip())
+def _by_number(quantity: str, signal: Signal, key: str, number: float) -> tuple[str, float]:
+    """Dimension and factor to SI of a signal for which the mapping gives a number."""
+    rule = _NUMBERS[key]
+    if quantity not in rule.roles:
+        raise _Fault(f"{key} has no meaning for {quantity}")
+    unit = rule.units.get((signal.unit or rule.bare).strip())
     if unit is None:
-        raise _Fault(
-            f"{_called(signal)} is in {signal.unit}; with effective_area it must be a pressure in Pa, kPa or bar"
-        )
-    return "force", area * unit
-
-
-def _current(quantity: str, signal: Signal, torque_constant: float) -> tuple[str, float]:
-    """Torque for a unit of a motor's current."""
-    if quantity not in ("torque", "torque_limit"):
-        raise _Fault(f"torque_constant has no meaning for {quantity}")
-    unit = _CURRENTS.get((signal.unit or "A").strip())
-    if unit is None:
-        raise _Fault(f"{_called(signal)} is in {signal.unit}; with torque_constant it must be a current in A or mA")
-    return "torque", torque_constant * unit
-
-
-def _percentage(quantity: str, signal: Signal, reference_torque: float) -> tuple[str, float]:
-    """Torque for one per cent of a reference torque [N m]."""
-    if quantity not in ("torque", "torque_limit"):
-        raise _Fault(f"reference_torque has no meaning for {quantity}")
-    if (signal.unit or "").strip() != "%":
-        raise _Fault(f"{_called(signal)} is in {signal.unit or 'no unit'}; with reference_torque it must be %")
-    return "torque", reference_torque / 100.0
+        raise _Fault(f"{_called(signal)} is in {signal.unit or rule.bare}; with {key} it must be {rule.wanted}")
+    return rule.dimension, number * unit
 
 
 def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple[float, float]:
@@ -337,36 +324,28 @@ def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple
         radii = [w.radius for w in config.wheel if part.name in ("both", w.axle)] or [radius]
         if part.name == "both":  # its shaft turns faster, with less torque
             ratios = [a.gear_ratio for a in config.axle if a.name != "both"] or [1.0]
-            if quantity == "speed":
-                return -MAX_SPEED / min(radii) * max(ratios), MAX_SPEED / min(radii) * max(ratios)
-            radii = [r / min(ratios) for r in radii]
+            radii = [r / (max(ratios) if quantity == "speed" else min(ratios)) for r in radii]
         radius = min(radii) if quantity == "speed" else max(radii)
-    match quantity:
-        case "torque" | "torque_limit":
-            return -2.0 * weight * radius, 2.0 * weight * radius
-        case "speed" | "motor_speed":
-            return -MAX_SPEED / radius, MAX_SPEED / radius
-        case "load":
-            return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
-        case "sinkage":
-            return -0.1 * radius, radius
-        case "ground_speed":
-            return -MAX_SPEED, MAX_SPEED
-        case "draft":
-            return -2.0 * weight, 2.0 * weight
-        case "pitch":
-            return -1.0, 1.0
-        case "acceleration":
-            return -20.0, 20.0
-        case "roll" | "steering_angle":
-            return -1.6, 1.6
-        case "yaw_rate":
-            return -4.0, 4.0  # a skid-steered rover on the spot
-        case "latitude":
-            return -math.pi / 2.0, math.pi / 2.0
-        case "longitude":
-            return -math.pi - 1e-9, math.pi + 1e-9  # 180 degrees, however it is rounded
-    return -math.inf, math.inf
+    if quantity == "load":
+        return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
+    if quantity == "sinkage":
+        return -0.1 * radius, radius
+    greatest = {
+        "torque": 2.0 * weight * radius,
+        "torque_limit": 2.0 * weight * radius,
+        "speed": MAX_SPEED / radius,
+        "motor_speed": MAX_SPEED / radius,
+        "ground_speed": MAX_SPEED,
+        "draft": 2.0 * weight,
+        "pitch": 1.0,
+        "roll": 1.6,
+        "steering_angle": 1.6,
+        "acceleration": 20.0,
+        "yaw_rate": 4.0,  # a skid-steered rover on the spot
+        "latitude": math.pi / 2.0,
+        "longitude": math.pi + 1e-9,  # 180 degrees, however it is rounded
+    }.get(quantity, math.inf)
+    return -greatest, greatest
 
 
 def _mapped_twice(roles: Iterable[_Role]) -> list[str]:
@@ -395,6 +374,3 @@ def _identifiers_shared(channels: Iterable[Channel], database: Database) -> list
         if known != name:
             faults.append(f"messages {known} and {name} have the same identifier {message.frame_id:#x}")
     return faults
-
-
-__all__ = ["channels_of", "checked_messages", "found_signal", "load_databases", "plausible", "without_unit"]

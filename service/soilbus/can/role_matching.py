@@ -26,22 +26,6 @@ from soilbus.can.channels import WHOLE, path_of
 from soilbus.can.j1939 import pgn_of
 from soilbus.can.units import Unit, unit_of
 
-__all__ = [
-    "ASSERTED",
-    "AXLES",
-    "UNIT_ALONE",
-    "WHEELS",
-    "Assignment",
-    "Candidate",
-    "Slot",
-    "assigned",
-    "axles_of",
-    "candidates",
-    "described",
-    "dimensions_of",
-    "is_word_in",
-]
-
 _LETTERS = {"front": "F", "middle": "M", "rear": "R", **{str(k): str(k) for k in range(1, 5)}}
 """Letter of the wheels of each axle, front to rear; four axles have numbers."""
 AXLES = (*_LETTERS, "both")

@@ -122,14 +122,16 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
     verdict = np.zeros(len(raw), dtype=np.uint8)
     seen = physical if rule.is_float else raw
     outside = (seen < rule.low) | (seen > rule.high)
-    if outside.any():
+    all_within = not outside.any()
+    if not all_within:
         verdict[outside] = _VERDICT[Reason.OUT_OF_RANGE]
         if rule.bands is not None:
             _mark_bands(verdict, raw, outside, rule.bands)
     if rule.is_float:
         verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
     for code, reason in rule.special:
-        verdict[raw == code] = _VERDICT[reason]
+        if not all_within or rule.is_float or rule.low <= code <= rule.high:
+            verdict[raw == code] = _VERDICT[reason]
     return verdict
 
 

@@ -67,49 +67,49 @@ class MessageBus(Protocol):
         """Close the interface."""
 
 
-class Wire(Protocol):
-    """Open bus.  All methods raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present."""
+class MessageWire:
+    """Open bus of any interface of python-can.
 
-    overruns: int
-    """Frames that came and were dropped for want of room since it was opened."""
-    room: float
+    All methods raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present.
+    """
+
+    overruns = 0
+    """Frames that came and were dropped for want of room since it was opened; 0 where none can tell."""
+    room = math.inf
     """Bytes of the buffer in which frames wait for us."""
 
+    def __init__(self, bus: MessageBus) -> None:
+        self._bus = bus
+
     def recv(self, timeout: float) -> Received | can.Message | None:
-        """Return the next frame, or None after `timeout` [s]."""
+        """Return the next frame, or None after `timeout` [s]; frames of ours are passed over where they come back."""
+        return self._bus.recv(timeout)
 
     def stamping_time(self) -> float:
         """Return the present time [s] by the clock that stamps frames as they come; nan where that is not known."""
+        return math.nan  # devices have clocks of their own
 
     def heard_until(self) -> float:
         """Return the stamp [s] before which no frame can come any more; -inf where that is not known."""
+        return -math.inf
 
     def send(self, frame: Frame) -> None:
         """Hand one frame to the driver, never waiting."""
+        message = can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
+        self._bus.send(message)
 
     def shutdown(self) -> None:
         """Close the bus."""
+        self._bus.shutdown()
 
 
-def wire_of(bus: MessageBus) -> Wire:
-    """Return a Wire for the bus that python-can has opened, by its socket where it is the kernel's."""
-    own = getattr(bus, "socket", None)
-    if isinstance(own, socket.socket) and own.family == socket.AF_CAN:
-        return SocketWire(bus, own)
-    return MulticastWire(bus) if is_multicast(bus) else MessageWire(bus)
-
-
-def is_multicast(bus: MessageBus) -> bool:
-    """Return whether a bus is a multicast group of python-can (interface udp_multicast)."""
-    return type(bus).__module__.startswith("can.interfaces.udp_multicast")
-
-
-class SocketWire:
+class SocketWire(MessageWire):
     """A raw CAN socket of the kernel."""
 
     def __init__(self, bus: MessageBus, own: socket.socket) -> None:
+        super().__init__(bus)
         self.overruns, self.room = 0, float(own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
-        self._bus, self._socket = bus, own
+        self._socket = own
         self._dropped = 0  # the kernel's count, modulo 2**32
         own.setblocking(False)
         own.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
@@ -120,7 +120,6 @@ class SocketWire:
         self._poll.register(own, select.POLLIN)
 
     def recv(self, timeout: float) -> Received | None:
-        """Return the next frame as Wire does; frames of this socket itself are passed over."""
         frame = self._next()
         if frame is None and timeout > 0.0:
             time.sleep(min(timeout, GATHER))
@@ -152,52 +151,15 @@ class SocketWire:
         )  # fmt: skip
 
     def stamping_time(self) -> float:
-        """Return the time as Wire does."""
         return time.time()
 
     def heard_until(self) -> float:
-        """Return the stamp as Wire does; a frame that is stamped is in the socket within STAMPED."""
-        now = time.time()
+        now = time.time()  # a frame that is stamped is in the socket within STAMPED
         return -math.inf if self._poll.poll(0) else now - STAMPED
 
     def send(self, frame: Frame) -> None:
-        """Send as Wire does."""
         word = frame.arbitration_id | _EXTENDED if frame.extended else frame.arbitration_id
         self._socket.send(_FRAME.pack(word, len(frame.data), frame.data))
-
-    def shutdown(self) -> None:
-        """Close as Wire does."""
-        self._bus.shutdown()
-
-
-class MessageWire:
-    """Bus of any other interface of python-can."""
-
-    overruns, room = 0, math.inf  # none of them can tell
-
-    def __init__(self, bus: MessageBus) -> None:
-        self._bus = bus
-
-    def recv(self, timeout: float) -> Received | can.Message | None:
-        """Return the next frame as Wire does."""
-        return self._bus.recv(timeout)
-
-    def stamping_time(self) -> float:
-        """Return nan: devices have clocks of their own."""
-        return math.nan
-
-    def heard_until(self) -> float:
-        """Return the stamp as Wire does."""
-        return -math.inf
-
-    def send(self, frame: Frame) -> None:
-        """Send as Wire does."""
-        message = can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
-        self._bus.send(message)
-
-    def shutdown(self) -> None:
-        """Close as Wire does."""
-        self._bus.shutdown()
 
 
 class MulticastWire(MessageWire):
@@ -212,7 +174,6 @@ class MulticastWire(MessageWire):
         self._echoes: dict[tuple[int, bytes], list[float]] = {}
 
     def recv(self, timeout: float) -> Received | can.Message | None:
-        """Return the next frame as Wire does; own frames are passed over."""
         message = super().recv(timeout)
         if message is None or not self._echoes:
             return message
@@ -223,12 +184,24 @@ class MulticastWire(MessageWire):
         return None if expected else message
 
     def send(self, frame: Frame) -> None:
-        """Send as Wire does."""
         now = time.monotonic()
         if len(self._echoes) >= MAX_ECHOES:  # of a group that this host does not hear
             self._echoes = {key: times for key, times in self._echoes.items() if times[-1] > now - ECHO_TIME}
         self._echoes.setdefault((frame.arbitration_id, frame.data), []).append(now)
         super().send(frame)
+
+
+def wire_of(bus: MessageBus) -> MessageWire:
+    """Return the wire of a bus that python-can has opened: its socket where it is the kernel's."""
+    own = getattr(bus, "socket", None)
+    if isinstance(own, socket.socket) and own.family == socket.AF_CAN:
+        return SocketWire(bus, own)
+    return MulticastWire(bus) if is_multicast(bus) else MessageWire(bus)
+
+
+def is_multicast(bus: MessageBus) -> bool:
+    """Return whether a bus is a multicast group of python-can (interface udp_multicast)."""
+    return type(bus).__module__.startswith("can.interfaces.udp_multicast")
 
 
 def error_number(error: Exception) -> int | None:

@@ -187,7 +187,7 @@ def command_line() -> argparse.ArgumentParser:
     )  # fmt: skip
     sub.add_argument(
         "--mcap", type=Path, metavar="OUT.mcap",
-        help="windows, positions, warnings for Foxglove or PlotJuggler (extra: mcap)",
+        help="windows, positions, warnings and the frames, for Foxglove, PlotJuggler, replay (extra: mcap)",
     )  # fmt: skip
     sub.add_argument(
         "--map", type=Path, metavar="OUT",

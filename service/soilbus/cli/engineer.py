@@ -6,7 +6,8 @@ Each function takes the parsed arguments, imports what it needs, does the work a
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +27,7 @@ from soilbus.files import whole_file, write_text
 from soilbus.process import say
 
 if TYPE_CHECKING:
+    from soilbus.can.candump import Frame
     from soilbus.config.model import Config
     from soilbus.pipeline.result import WindowResult
     from soilbus.report.page import Source
@@ -162,7 +164,7 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     if args.table is not None:
         write_table(args.table, results, config)
     if args.mcap is not None:
-        write_mcap(args.mcap, results, config)
+        write_mcap(args.mcap, results, config, _frames_read(args, config))
     if args.map is not None:
         map_text, left_out = soil_map(results)
         if args.map.suffix == ".gpkg":
@@ -173,6 +175,21 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
             say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
         say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
+
+
+def _frames_read(args: argparse.Namespace, config: Config) -> Iterator[tuple[str, Frame]]:
+    """The frames of the logs with their channels, read again; none of tables and of standard input."""
+    from soilbus.offline.replay import LogError, log_of
+
+    if config.columns is not None or config.table is not None:
+        return
+    if "-" in map(str, args.logs):
+        say("--mcap: standard input cannot be read again, so the file holds no frames and cannot be replayed")
+        return
+    for path in args.logs:
+        log = log_of(config, path)
+        with suppress(LogError):  # said before; the frames before the damage count
+            yield from ((log.chosen, frame) for frame in log.frames())
 
 
 def _check_files(args: argparse.Namespace, config: Config) -> None:

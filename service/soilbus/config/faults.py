@@ -87,8 +87,8 @@ def _text(error: Any) -> str:
 
 def _unknown_key(location: Sequence[Any]) -> str:
     """Where the key belongs, if it is one of another section of the machine, or else which one was meant."""
-    if tuple(location) in _LEFT:
-        return _LEFT[tuple(location)]
+    if tuple(location) in _GONE:
+        return f"is gone: {_GONE[tuple(location)]}"
     key = str(location[-1])
     tables = [name for name in _OF_MACHINE if key in _keys((name,))]
     places = [f"[[{name}]]" if name in _REPEATED else f"[{name}]" for name in tables]
@@ -97,13 +97,17 @@ def _unknown_key(location: Sequence[Any]) -> str:
     return f"unknown key{did_you_mean(key, _keys(location[:-1]))}"
 
 
-_LEFT: Mapping[tuple[Any, ...], str] = {
+_GONE: Mapping[tuple[Any, ...], str] = {
+    ("estimator", "max_chi2"): (
+        "chi-square judges no window any more: remove it; max_prediction_error, a share of torque and pull, judges now"
+    ),
+    ("estimator", "min_track_load_change"): "windows at a constant load are judged by their widths: remove it",
     ("mqtt",): (
         "the service holds no connection to a network: remove this section; soilbus watch --json prints the results"
         " for mosquitto_pub -l (soilbus docs systemd)"
-    )
+    ),
 }
-"""What replaces a section that earlier versions had."""
+"""Keys that earlier versions had, and what to write instead."""
 _REPEATED = ("axle", "wheel", "track")
 _OF_MACHINE = ("vehicle", *_REPEATED, "signals")
 

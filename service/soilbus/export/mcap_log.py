@@ -3,6 +3,7 @@
     /soilbus/window      one message a window: the keys of `replay --json`, SI units, unit in the schema's descriptions
     /soilbus/location    foxglove.LocationFix, where a position is mapped: the middle of the window's data
     /soilbus/warning     foxglove.Log, one message where a warning of immobilisation began
+    /can                 can_msgs/Frame, each frame of the log that was read, so that the file can be replayed
 
 What is not known is absent, not null: plotters take null for a type of its own, and Foxglove refuses a schema that
 allows for it.  Times are those of the log [ns].
@@ -12,11 +13,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from soilbus import __version__
+from soilbus.can.admission import LAST_TIME
+from soilbus.can.candump import Frame
+from soilbus.can.mcap_frames import FRAME_SCHEMA, frame_message, nanoseconds
 from soilbus.config.model import Config
 from soilbus.export.columns import SCHEMA_VERSION, column
 from soilbus.files import whole_file_of_bytes
@@ -51,8 +57,16 @@ LOG_SCHEMA = {
 }
 
 
-def write_mcap(path: Path, results: Sequence[WindowResult], config: Config) -> None:
-    """Write the windows, in the order of their times; NotWritten."""
+def write_mcap(
+    path: Path, results: Sequence[WindowResult], config: Config, frames: Iterable[tuple[str, Frame]] = ()
+) -> None:
+    """Write the windows in the order of their times, and between them frames, each with its channel, in theirs.
+
+    Raises
+    ------
+    NotWritten
+        The file cannot be written.
+    """
     from mcap.writer import Writer
 
     records = [_without_unknowns(window_record(result, config)) for result in results]
@@ -64,20 +78,32 @@ def write_mcap(path: Path, results: Sequence[WindowResult], config: Config) -> N
             "/soilbus/window": window_schema(records),
             "/soilbus/location": LOCATION_SCHEMA,
             "/soilbus/warning": LOG_SCHEMA,
+            "/can": FRAME_SCHEMA,
         }
         channels = {}
         for topic, schema in topics.items():
             schema_id = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
             channels[topic] = writer.register_channel(topic, "json", schema_id)
         messages = [m for result, record in zip(results, records, strict=True) for m in _messages(result, record)]
-        for n, (t, topic, message) in enumerate(sorted(messages, key=lambda each: each[0])):
-            stamp = _nanoseconds(t)
+        logged = (
+            (frame[0], "/can", frame_message(channel, frame))
+            for channel, frame in frames
+            if -LAST_TIME <= frame[0] <= LAST_TIME
+        )
+        in_order = merge(logged, sorted(messages, key=_time_of), key=_time_of)
+        for n, (t, topic, message) in enumerate(in_order):
+            stamp = max(nanoseconds(t), 0)
             writer.add_message(channels[topic], stamp, json.dumps(message).encode(), stamp, n)
         writer.finish()
 
 
-def _messages(result: WindowResult, record: Mapping[str, Any]) -> Iterator[tuple[float, str, Mapping[str, Any]]]:
-    """Time [s], topic and message of what one window says."""
+_Message = tuple[float, str, Mapping[str, Any]]
+"""Time [s], topic and content."""
+_time_of: Callable[[_Message], float] = itemgetter(0)
+
+
+def _messages(result: WindowResult, record: Mapping[str, Any]) -> Iterator[_Message]:
+    """What one window says."""
     yield result.t, "/soilbus/window", record
     if result.position is not None:
         latitude, longitude = (math.degrees(angle) for angle in result.position)
@@ -130,10 +156,6 @@ def _without_unknowns(record: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _nanoseconds(t: float) -> int:
-    return max(round(t * 1e9), 0)
-
-
 def _time(t: float) -> dict[str, int]:
-    sec, nsec = divmod(_nanoseconds(t), 1_000_000_000)
+    sec, nsec = divmod(max(nanoseconds(t), 0), 10**9)
     return {"sec": sec, "nsec": nsec}

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column
 from soilbus.can.checksum import COUNTER, checksum_byte, column_checksums
-from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.mapping import channels_of
 from soilbus.can.publish import value_codes
 from soilbus.config.model import Config
 from soilbus.grouping import grouped
