@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -124,19 +125,27 @@ class Machine:
         samples |= {f"torque.{w}": wheels[4 + k] for k, w in enumerate(WHEELS)}
         return window_of_samples(self.rig, t, {n: v for n, v in samples.items() if n not in self.unknown}), stood
 
+    def alerts(self, window: Window) -> set[Alert]:
+        """Everything that the watch reports."""
+        return {state.warning for _, state in self.watched(window)}
+
     def warned(self, window: Window) -> list[float]:
         """When warnings begin [s]."""
+        states = [(-math.inf, Watch()), *self.watched(window)]
+        warned = [(t, state.warning is Alert.IMMOBILISATION) for t, state in states]
+        return [t for (_, before), (t, now) in pairwise(warned) if now and not before]
+
+    def watched(self, window: Window) -> list[tuple[float, Watch]]:
+        """The watch at each look."""
         config, rig = Config(), self.rig
         config = config.model_copy(update={"estimator": replaced(config.estimator, min_speed=self.min_speed)})
         limit = np.full(4, self.limit * self.mass * GRAVITY / 4.0 * self.radius if self.known_limit else np.nan)
-        state, begun = Watch(), []
+        state, out = Watch(), []
         for i in range(len(window.t)):
             moment = moment_of(forward(window.rows(np.arange(max(i - 2, 0), i + 1))), rig, limit, config)
-            later = watched(state, moment, None, config)
-            if Alert.IMMOBILISATION is later.warning is not state.warning:
-                begun.append(float(window.t[i]))
-            state = later
-        return begun
+            state = watched(state, moment, None, config)
+            out.append((float(window.t[i]), state))
+        return out
 
 
 def replaced(section, **values):
@@ -199,6 +208,27 @@ def test_every_machine_is_warned_before_it_stands(case, seed):
 def test_ordinary_drives_are_left_in_peace(case, seed):
     window, _ = ORDINARY[case].driven(seed)
     assert ORDINARY[case].warned(window) == []
+
+
+def without_ground_speed(machine):
+    return replace(machine, unknown=(*machine.unknown, "ground_speed"))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("case", ["rover", "rear-driven tractor", "one motor's torque is unknown"])
+def test_a_machine_without_a_ground_speed_is_warned_by_its_acceleration(case, seed):
+    machine = without_ground_speed(BOGGED[case][0])
+    window, stood = machine.driven(seed)
+    begun = machine.warned(window)
+    assert begun
+    assert machine.softens < begun[0] < stood
+
+
+@pytest.mark.parametrize("case", ORDINARY)
+def test_ordinary_drives_without_a_ground_speed_are_no_cause_and_no_all_clear(case):
+    machine = without_ground_speed(ORDINARY[case])
+    window, _ = machine.driven(1)
+    assert machine.alerts(window) == {Alert.UNKNOWN}
 
 
 ON_ICE = Machine(softens=0.0, soft=(0.06, 0.7, 0.7, 0.06), base=0.3, digs=0.0, gain=1.5, ramp=4.0, known_limit=True)

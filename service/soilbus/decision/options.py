@@ -38,18 +38,18 @@ class WatchOptions:
     shake_memory: float = 5.0
     """Time constant [s] of forgetting how much slip shakes: ten periods of a vehicle on its tyres."""
 
+    reckoning_time: float = 5.0
+    """Time [s] in which a ground speed reckoned from the acceleration returns to that of the wheels."""
+
     warning_time: float = 10.0
     """Time [s] ahead within which a capacity is to fall to the demand, or a demand is to outgrow it."""
     hold: float = 5.0
     """Time [s] after its last cause at which such a warning ends."""
     significant_sd: float = 2.5
     """Standard deviations by which a capacity must fall."""
-    lost_ratio: float = 4.0
-    """A fall is extrapolated over at most so many times what is lost already.  At 5 two furrows of `e-plough-loam`
-    warned, without a limit each."""
-    form_error: float = 0.3
-    """Least relative error of the curve's steepness at small slips: what its std does not say.  At 0.25 two furrows of
-    `e-plough-loam` warned."""
+    form_error: float = 0.12
+    """Sd of the share [1] by which a curve's reserve of pull is wrong, which its std does not say: at 0.3 ploughing on
+    a dry field (`b-plough-4wd`) had a false warning."""
     check_lag: float = 2.0
     """Time [s] after which an extrapolated demand is compared with what came."""
     check_memory: float = 60.0

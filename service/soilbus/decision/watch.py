@@ -4,7 +4,7 @@
     stalls         V < v_min, no wheel turns, and thrust exceeds what draft, slope and inertia ask, or all motors are
                    at their limits
     stops          P(q + h dq/dt > -ln(1 - s_max)) or P(V + h dV/dt < 0) > p while thrust holds, q = -ln(1 - s)
-    weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q: the ground gives less than its curve
+    weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q, beyond what a wrong curve explains
     outgrows       P(Q + h dQ/dt > C) > p, by the errors of earlier such extrapolations and the curve's width
     creeps         P(s + h ds/dt > s_max) > p, by the same errors of slip
     takes all      Q > 0.9 max P_hat
@@ -14,6 +14,9 @@ P: pull given, P_hat: pull over slip of the last window (Kalman filter and regre
 The first three and `creeps` need no soil: a local linear trend follows q, V and sinkage, and slip that shakes widens
 it.  The others need the curve and some seconds of moments.  The moments are kept and seen along the newest curve: so a
 new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.
+
+Without a ground speed `stops` reckons one from acceleration and wheels, dV/dt = a + (r omega - V) / tau, which may warn
+but gives no all-clear.
 
 Spinning or stalling for `spin_time` overrules a go of the estimate; without any way for `stuck_time` the vehicle is
 stuck, until it has moved.
@@ -281,21 +284,17 @@ def left_by(
     lately = x > -options.slow_memory
     if 2 * np.count_nonzero(np.isfinite(capacity[lately])) <= np.count_nonzero(lately):
         return now
-    slow, fast = (Line.through(x, capacity, memory) for memory in (options.slow_memory, options.fast_memory))
-    limit, width = min(slow.value, most), min(std, options.widest * most)
+    limit = min(Line.through(x, capacity, options.slow_memory).value, most)
+    width = min(std, options.widest * most)
     works = works and compares and demand.line.value > options.least_share * limit
     leads = works and demand.probability_above(limit - width, width, options) > options.outgrows
     left = demand.time_to(limit) if leads else math.inf
     outgrown = "draft and slope are to outgrow the ground"
     now = _seen(now, 1, lasts[1] if leads else 0.0, left, outgrown, options.lasting)
-    peak = float(rows[:, 3].max())
-    weak = [
-        _time_to_weaken(line, memory, x, capacity, reserve, peak, (most, std / most), options)
-        for line, memory in ((slow, options.slow_memory), (fast, options.fast_memory))
-    ]
-    falls, left = any(warns for _, warns in weak), min(left for left, _ in weak)
+    left = _time_to_weaken(x, capacity, reserve, float(rows[:, 3].max()), options)
+    weakens = left < options.warning_time
     cause = "the ground is to give less than is asked"
-    now = _seen(now, 2, lasts[2] if falls else 0.0, left, cause, options.lasting_fall)
+    now = _seen(now, 2, lasts[2] if weakens else 0.0, left, cause, options.lasting_fall)
     share = max(now.share, demand.line.value / limit) if limit > 0.0 else 1.0
     return now._replace(share=share, time_left=math.inf if now.time_left is None else now.time_left)
 
@@ -322,39 +321,30 @@ def _std_of_most(curve: OverSlip) -> float:
     return float(curve.pull_std[int(np.nanargmax(curve.pull))])
 
 
-def _time_to_weaken(
-    line: Line, memory: float, x: Array, capacity: Array, reserve: Array, peak: float, most: tuple[float, float],
-    options: WatchOptions,
-) -> tuple[float, bool]:  # fmt: skip
-    """Time [s] until the capacity falls to the greatest demand [N], inf where it does not surely fall; whether to warn.
-
-    line: through the capacity, with this memory [s]; most: largest pull [N] and its relative sd.
+def _time_to_weaken(x: Array, capacity: Array, reserve: Array, peak: float, options: WatchOptions) -> float:
+    """Return the time [s] until the capacity falls to the greatest demand [N]; inf where it does not surely fall.
 
     Notes
     -----
-    The capacity C = P + R falls as P does and the curve's P_hat = -R does not.  Where both rise and fall together, a
-    curve that is wrong by the factor a would say so too: C' = P' - a P_hat', |ln a| < its error.  Where slip falls, the
-    wheels are relieved.
+    C = c + b x + e R: where the curve's reserve R is wrong by a share e of sd `form_error`, the capacity follows slip.
     """
-    if line.slope >= 0.0 or line.spread <= 0.0:
-        return math.inf, False
+    known = np.isfinite(capacity)
+    x, capacity, reserve = x[known], capacity[known], reserve[known]
     before = capacity[np.searchsorted(x, x - options.scatter_lag - 1e-6)]
     changes = (capacity - before)[x > x[0] + options.scatter_lag]
-    changes = changes[np.isfinite(changes)]
     if len(changes) < 4:
-        return math.inf, False
-    scatter = float(changes @ changes) / len(changes) / 2.0
-    if -line.slope < options.significant_sd * math.sqrt(options.scatter_lag / memory * scatter / line.spread):
-        return math.inf, False
-    largest, relative = most
-    predicted = -Line.through(x, np.where(np.isfinite(capacity), reserve, np.nan), memory).slope
-    given = line.slope + predicted
-    error = max(options.significant_sd * relative, options.form_error)
-    if predicted < 0.0 or (predicted > 0.0 and given > 0.0 and math.log(predicted / given) < error):
-        return math.inf, False
-    usual = min(float(np.nanquantile(capacity, 0.8)), (1.0 + relative) * largest)
-    lost, left = usual - line.value, max(line.value - peak, 0.0) / -line.slope
-    return left, left < options.warning_time and line.value - peak <= options.lost_ratio * lost
+        return math.inf
+    like = options.scatter_lag * (len(x) - 1) / (x[-1] - x[0])  # rows with the same scatter
+    variance = max(float(changes @ changes) / len(changes) / 2.0, 1.0) * like
+    columns, prior = np.stack([np.ones_like(x), x, reserve]), np.diag([0.0, 0.0, options.form_error**-2])
+    left = math.inf
+    for memory in (options.slow_memory, options.fast_memory):
+        weighted = columns * np.exp(x / memory)
+        covariance = np.linalg.inv(weighted @ columns.T / variance + prior)
+        now, slope, error = (covariance @ (weighted @ capacity) / variance).tolist()
+        if slope < -options.significant_sd * math.sqrt(covariance[1, 1]):
+            left = min(left, max(now + error * float(reserve[-1]) - peak, 0.0) / -slope)
+    return left
 
 
 class Watch(NamedTuple):
@@ -376,6 +366,8 @@ class Watch(NamedTuple):
         Slip, and pull [N], low-pass filtered with the time constant `spin_time`; nan where not known.
     engaged
         Which wheels drive.
+    reckoned
+        [m/s], ground speed from acceleration and wheels; nan where the acceleration is not measured.
     stall, margin
         What slip and speed say, and what the curve leaves.
     caused
@@ -397,6 +389,7 @@ class Watch(NamedTuple):
     slip: float = math.nan
     pull: float = math.nan
     engaged: tuple[bool, ...] = ()
+    reckoned: float = math.nan
     stall: Stall = Stall()
     margin: Margin = Margin()
     caused: float = -math.inf
@@ -424,10 +417,16 @@ def watched(
     options
         Tuning values.
     """
-    limits, stall = config.traversability, before.stall
-    if moment.last is not None:
-        stall = stalling(stall, moment.last, config.estimator.min_speed, config.warning, limits, options)
-    now, margin = _moved(before, moment, config)._replace(stall=stall, engaged=moment.engaged), before.margin
+    limits, stall, reckoned = config.traversability, before.stall, math.nan
+    if (sample := moment.last) is not None:
+        reckoned = _reckoned(before, moment, sample, options)
+        if blind := math.isnan(sample.ground):
+            sample = sample._replace(ground=reckoned, ground_var=sample.rim_var)
+        stall = stalling(stall, sample, config.estimator.min_speed, config.warning, limits, options)
+        if blind:  # what is reckoned is no all-clear
+            stall = stall._replace(heard=before.stall.heard)
+    now, margin = _moved(before, moment, config), before.margin
+    now = now._replace(stall=stall, engaged=moment.engaged, reckoned=reckoned)
     if moment.engaged != before.engaged:  # another drive has another curve
         margin = Margin()
     if math.isfinite(moment.common + moment.given):
@@ -508,6 +507,18 @@ def _moved(before: Watch, moment: Moment, config: Config) -> Watch:
         slip=moment.slip + kept * (before.slip - moment.slip) if kept else moment.slip,
         pull=moment.pull + kept * (before.pull - moment.pull) if kept else moment.pull,
     )
+
+
+def _reckoned(before: Watch, moment: Moment, sample: Sample, options: WatchOptions) -> float:
+    """Return the ground speed [m/s] from the acceleration since before, drawn to the wheels' speed; nan without one."""
+    step = moment.t - before.t
+    if not (math.isfinite(moment.pull) and math.isnan(sample.felt) and math.isfinite(sample.rim)):
+        return math.nan
+    rolls = sample.rim - sample.beside
+    if not 0.0 <= step <= LONGEST_GAP or math.isnan(before.reckoned):
+        return rolls
+    kept = math.exp(-step / options.reckoning_time)
+    return rolls + kept * (before.reckoned + step * moment.inertia / moment.mass - rolls)
 
 
 def _others_grip(moment: Moment, spins: Sequence[bool]) -> bool:
