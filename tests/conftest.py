@@ -17,7 +17,7 @@ import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
-IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/test_demo.py")
+IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/cli/test_demo.py")
 """What waits for a bus, a guest kernel or a service most of the time."""
 
 

@@ -21,7 +21,7 @@ import soilbus
 from soilbus.cli.main import main
 from soilbus.daemon.service import software_version
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = Path(__file__).resolve().parents[2]
 PUBLIC = (
     "soilbus",
     *(

@@ -20,7 +20,7 @@ from soilbus.cli.main import main
 from soilbus.config.file import load_config, machine, overridden, parse_config
 from soilbus.config.model import Config, ConfigError
 
-FIELD = Path(__file__).resolve().parent / "field/field.toml"
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 JARGON = re.compile(
     r"Input should|instance of|valid (?:dict|number|string|list|integer|boolean)|validat|pydantic|Extra inputs|"
     r"unable to parse|NoneType|type=|List should|<class|Traceback|wheel\.\d"

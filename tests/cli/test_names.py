@@ -294,7 +294,7 @@ def test_a_text_of_a_configuration_is_one_printable_line(key, name, tmp_path, sa
 
 @each_of(*UNTIDY)
 def test_beds_and_columns_of_a_test_rig_are_text(name, tmp_path, says):
-    rig = Path(__file__).resolve().parents[1] / "service/docs/notebooks"
+    rig = Path(__file__).resolve().parents[2] / "service/docs/notebooks"
     with (rig / "rig.csv").open(newline="", encoding="utf-8") as file:
         head, *rows = list(csv.reader(file))
     document = tomlkit.parse((rig / "rig.toml").read_text())

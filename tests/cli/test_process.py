@@ -13,7 +13,7 @@ import pytest
 
 from soilbus.simulator.reference import TRACTOR
 
-FIELD = Path(__file__).resolve().parent / "field/field.toml"
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 PROGRAM = (sys.executable, "-m", "soilbus")
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "LC_", "LANG"))}
 PATH = {"PYTHONPATH": os.environ.get("PYTHONPATH", "")}

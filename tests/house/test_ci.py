@@ -6,7 +6,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-CI = Path(__file__).resolve().parents[1] / ".ci"
+CI = Path(__file__).resolve().parents[2] / ".ci"
 
 
 def test_missing_recordings_are_one_line_before_any_work(tmp_path: Path) -> None:

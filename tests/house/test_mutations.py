@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from mutations import MUTATIONS, ROOT, is_there
+
+from tests.mutations import MUTATIONS, ROOT, is_there
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "service" / "soilbus"
+PACKAGE = Path(__file__).resolve().parents[2] / "service" / "soilbus"
 PICTURE = PACKAGE.parent / "docs" / "rooms.dot"
 ARROWS = re.findall(r"(\w+) -> (\w+);", PICTURE.read_text())
 

@@ -23,7 +23,7 @@ from soilbus.config.file import load_config
 from soilbus.config.model import ConfigError
 from soilbus.simulator.reference import TRACTOR
 
-FIELD = Path(__file__).resolve().parent / "field/field.toml"
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-UNIT = Path(__file__).resolve().parents[1] / "systemd" / "soilbus@.service"
+UNIT = Path(__file__).resolve().parents[2] / "systemd" / "soilbus@.service"
 
 
 def environment(of_unit: bool) -> dict[str, str]:

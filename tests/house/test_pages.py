@@ -11,7 +11,7 @@ from soilbus.cli.reference import pages
 from soilbus.config.model import Config
 from soilbus.terra.effects.catalogue import CATALOGUE
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = Path(__file__).resolve().parents[2]
 DOCS = REPO / "service" / "docs"
 PAGES = [
     *REPO.glob("*.md"),

@@ -73,7 +73,7 @@ def test_json_to_stdout_is_nothing_but_json(monkeypatch, capsys):
 
 
 def test_all_is_measured_with_as_many_threads_as_the_unit_gives_the_service(monkeypatch):
-    unit = (Path(__file__).parents[1] / "systemd/soilbus@.service").read_text()
+    unit = (Path(__file__).parents[2] / "systemd/soilbus@.service").read_text()
     assert f"OPENBLAS_NUM_THREADS={bench.THREADS} OMP_NUM_THREADS={bench.THREADS}" in unit
     seen = []
 
