@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
@@ -21,6 +22,8 @@ IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/cli/test_
 """What waits for a bus, a guest kernel or a service most of the time."""
 
 
+hypothesis.settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=50)
+hypothesis.settings.load_profile("seeded")
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # below nohup it is ignored, also by the processes that tests start
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.can.admission import Admission
@@ -95,7 +95,6 @@ def cases(draw: st.DrawFn) -> tuple[list[Signal], list[Channel]]:
     return signals, channels
 
 
-@settings(max_examples=100, deadline=None)
 @given(cases(), st.data())
 def test_samples_equal_those_judged_one_channel_at_a_time(
     case: tuple[list[Signal], list[Channel]], data: st.DataObject

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
@@ -57,7 +57,6 @@ def test_without_hysteresis_and_hold_the_window_decides():
 WINDOWS = st.lists(st.tuples(st.none() | st.floats(0.0, 1.0), st.sampled_from(Status)), max_size=30)
 
 
-@settings(derandomize=True, deadline=None)
 @given(windows=WINDOWS, hold=st.integers(1, 4), hysteresis=st.floats(0.0, 3.0))
 def test_never_better_than_the_window_allows(windows, hold, hysteresis):
     config = Settings(hold=hold, hysteresis=hysteresis)

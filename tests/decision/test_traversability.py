@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
@@ -201,7 +201,6 @@ TORQUES = st.lists(
 ).map(np.array)
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
 @given(
     soil=st.sampled_from(list(SOILS.values())),
     size=st.floats(0.0, 1.0),
