@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import lognorm
 
+from driven_windows import tracker_of, windows
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit, fit_window
@@ -18,7 +19,6 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from tests.lab.driven_windows import tracker_of, windows
 
 K_C = PARAMETERS.index("k_c")
 CLAY = "clayey_soil_38"

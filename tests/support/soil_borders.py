@@ -1,21 +1,18 @@
 """Drives over borders: how soon a valid estimate of the new soil comes, and whether any valid one is wrong.
 
 A window is valid once it determines the bearing pressure of a plate at a given depth.  It determines the pressure under
-its own tyres at about half their sinkage, and tan phi, sooner, even where loads hardly change.  The table has the time
-of both after the border, and the number of wrong windows.
-
-`python -m tests.lab.soil_borders [loam:wet_clay …] [--speeds 1.5] [--transition 1] [--seeds 20] [--first 1]`
-prints a table; `--windows` every window near the border besides.
+its own tyres at about half their sinkage, and tan phi, sooner, even where loads hardly change.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from cramer_rao import cramer_rao
+from driven_windows import errors, exact, task_of, windows
 from soilbus.config.model import Config, Vehicle
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
@@ -25,20 +22,16 @@ from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import new_soil_prior
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.wheel import Soil
 from soilbus.trials.windows import bins_of
-from tests.lab.cramer_rao import cramer_rao
-from tests.lab.driven_windows import errors, exact, sweep, task_of, windows
 
-PAIRS = ("loam:wet_clay", "wet_clay:loam", "loam:clayey_soil_38", "clayey_soil_38:loam")
 BEFORE, AFTER = 15.0, 10.0
 """Seconds on the first soil, at least, and on the second."""
 SPREAD = 2.0
 """Seconds over which the times of the border vary: windows end at whole ones."""
-WRONG, IN_TIME = 3.0, 2.0
-"""Standard deviations; seconds."""
+WRONG = 3.0
+"""Standard deviations."""
 OF_THIS_SOIL = ("none", "not_excited load_range", "not_excited slip_range", "not_excited load_range slip_range")
 """Reasons of windows whose estimate is of the soil under the wheels."""
 KNOWN = 0.10
@@ -171,54 +164,3 @@ def wrong_of_tyres(seen: list[Seen]) -> list[Seen]:
 def wrong(seen: list[Seen]) -> list[Seen]:
     """Windows that are valid and beyond what they say."""
     return [w for w in seen if w.valid and not w.away < WRONG]
-
-
-def figures(what: str, delay: list[float], away: list[float], bad: int) -> str:
-    """A line of the table: seconds from which it is known in each drive, errors in standard deviations, wrong ones."""
-    in_time, rms = np.mean(np.array(delay) <= IN_TIME), np.sqrt(np.mean(np.square(away)))
-    return (
-        f"  {what:38} {np.median(delay):16.2f} {max(delay):5.2f}  {in_time:10.0%}  {len(away):7d}  {bad:5d} {rms:5.2f}"
-    )
-
-
-def main() -> None:
-    """Prints the table."""
-    parser = sweep(__doc__ or "", 20)
-    parser.add_argument("pairs", nargs="*", default=list(PAIRS))
-    parser.add_argument("--speeds", type=float, nargs="+", default=[1.5])
-    parser.add_argument("--transition", type=float, default=1.0)
-    args = parser.parse_args()
-    config = reference_configuration()
-    print(f"{'pair':24} {'speed':>5} {'drives':>7}   from [s]: median  most  within 2 s  windows  wrong  rms")
-    for pair in args.pairs:
-        for speed in args.speeds:
-            drives = {
-                seed: crossed(config, pair, speed, args.transition, seed)
-                for seed in range(args.first, args.first + args.seeds)
-            }
-            bad = [(seed, w) for seed, seen in drives.items() for w in wrong(seen)]
-            of_tyres = sum(len(wrong_of_tyres(seen)) for seen in drives.values())
-            valid = [w.away for seen in drives.values() for w in seen if w.valid]
-            known = [w.of_tyres for seen in drives.values() for w in seen if w.knows_tyres]
-            print(f"{pair:24} {speed:5.2f} {len(drives):7d}")
-            print(figures("valid", [first_valid(seen) for seen in drives.values()], valid, len(bad)))
-            print(figures("under tyres", [first_of_tyres(seen) for seen in drives.values()], known, of_tyres))
-            sys.stdout.flush()
-            if args.windows:
-                for seed, seen in drives.items():
-                    for w in (w for w in seen if w.t > -4.0 - args.transition / speed):
-                        state = "valid" if w.valid else "-"
-                        print(f"  {seed:4d} {w.t:6.2f} {state:5} {w.away:5.1f} {w.sd:6.1%} {w.reason}")
-                continue
-            for seed, w in bad:
-                print(f"  seed {seed}: {w.away:.1f} sd off, {w.t:+.2f} s, sd {w.sd:.1%}")
-            for seed, seen in drives.items():
-                if first_valid(seen) > IN_TIME:
-                    w = max((w for w in seen if w.t <= IN_TIME), key=lambda w: w.t)
-                    least = least_sd(config, drive(config, pair, speed, args.transition, seed), IN_TIME)
-                    said = f"sd {w.sd:.1%}, {w.away:.1f} sd off; the bound at {IN_TIME} s is {least:.1%}"
-                    print(f"  seed {seed}: {w.reason} at {w.t:.2f} s: {said}")
-
-
-if __name__ == "__main__":
-    main()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -22,23 +21,6 @@ from soilbus.simulator.sensors import true_readings
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.trials import windows as service_windows
-
-__all__ = [
-    "B_REF",
-    "EXCITED",
-    "NAMES",
-    "Z_REF",
-    "c_and_K_known",
-    "constant",
-    "errors",
-    "exact",
-    "observed_window",
-    "sweep",
-    "task_of",
-    "tasks",
-    "tracker_of",
-    "windows",
-]
 
 Z_REF, B_REF = 0.02, 0.3
 NAMES = ("loam", "wet_clay", "dry_sand")
@@ -104,15 +86,6 @@ def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") 
     store, length = service_windows.bins_of(config, wanted), config.estimator.window
     for i, end in enumerate(np.arange(length, scenario.duration + 0.05, config.estimator.hop).tolist()):
         yield task_of(store.window(end - length, end), end, config, i)
-
-
-def sweep(text: str, seeds: int) -> argparse.ArgumentParser:
-    """Arguments of a sweep over drives: which seeds, and whether every window is printed."""
-    parser = argparse.ArgumentParser(description=text)
-    parser.add_argument("--seeds", type=int, default=seeds)
-    parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--windows", action="store_true")
-    return parser
 
 
 def exact(recording: Recording, config: Config, names: Iterable[str]) -> dict[str, Column]:
