@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.decision.capability import OverSlip
@@ -17,7 +17,7 @@ from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.trials import boggings, firm_drives
 from soilbus.trials.bogging_trials import Drive, Task, WarningTrial, figures, trial, warning_trials
-from tests.lab.watched_drives import Observation, judged, observed, watch
+from watched_drives import Observation, judged, observed, watch
 
 CONFIG = reference_configuration()
 SLIP = np.linspace(0.02, 0.6, 9)
@@ -97,7 +97,7 @@ def test_an_easy_draft_that_comes_and_goes_is_no_cause():
     assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_hard_draft_that_swings_is_no_cause_however_new_its_peaks(seed):
     rng = np.random.default_rng(seed)
     rate, phase = 2.0 * np.pi * rng.uniform(0.1, 0.4, 4), rng.uniform(0.0, 2.0 * np.pi, 4)
@@ -249,7 +249,6 @@ def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
 MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)
 
 
-@settings(derandomize=True, deadline=None, max_examples=150)
 @given(
     st.lists(
         st.tuples(st.floats(-2.0, 3.0), st.lists(MAYBE, max_size=4), MAYBE, st.booleans()), min_size=1, max_size=40

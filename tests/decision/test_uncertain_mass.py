@@ -31,14 +31,14 @@ def rear_driven(mass: float, std: float):
 
 @pytest.fixture(scope="module")
 def drafts(tmp_path_factory) -> dict[str, np.ndarray]:
-    """Largest draft and std [N], medians over each of four drives of a machine heavier than its data sheet says."""
+    """Largest draft and std [N], medians over each of three drives of a machine heavier than its data sheet says."""
     sheet = reference_configuration([], REFERENCES["tractor-2wd"]).vehicle.mass
     true = HEAVIER * sheet
     log = tmp_path_factory.mktemp("heavy") / "drive.log"
     driven = rear_driven(true, 0.0)
     configs = {"known": rear_driven(true, 1.0), "open": rear_driven(sheet, 0.25 * sheet)}
     out: dict[str, list] = {name: [] for name in configs}
-    for seed in (5, 6, 7, 8):
+    for seed in (5, 6, 7):
         write_log(frames(simulate(driven, excited("loam", 24.0), seed=seed), driven), log)
         for name, config in configs.items():
             found = [r.traversability.max_draft for r in replay(Pipeline(config, load_databases(config)), [log])]

@@ -21,7 +21,6 @@ LOG_STD = np.array([0.15, 0.05, 0.03, 0.025, 0.05, 0.05])
 SENSORS = 3
 """Gain errors of sensors that a belief carries before the effects' parameters."""
 MODELS = {
-    "tyre_deflection": "{name='tyre_deflection',compliance={value=4e-6,std=1e-6}}",
     "drivetrain_loss": "{name='drivetrain_loss',share={value=0.08,std=0.03},drag={value=60.0,std=20.0}}",
     "two": "{name='multipass',stiffness={value=0.4,std=0.15},density={value=0.08,std=0.05}},"
     "{name='bulldozing',density={value=3e5,std=1e5}}",

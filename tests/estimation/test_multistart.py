@@ -58,7 +58,7 @@ def wet_clay_fit(wet_clay):
     return fit_window(wet_clay.problem(), wet_clay.prior)
 
 
-@pytest.mark.parametrize("seed", [50, 51, 52, 53])
+@pytest.mark.parametrize("seed", [50, 51])
 def test_fits_from_unlike_soils_end_at_the_same_optimum(seed, simulated):
     """A descent ends where 0.1 sd are left: ends differ by no more, and widths by what the curvature changes there."""
     case = simulated(SOILS["wet_clay"], seed)
