@@ -125,14 +125,6 @@ def test_different_ends_are_no_figure(small, monkeypatch, capsys):
     assert "standard deviations apart" in err
 
 
-def test_the_papers_solve_is_the_peers_and_faster(monkeypatch):
-    monkeypatch.setattr(paper, "ROUNDS", 1)
-    monkeypatch.setattr(paper, "SOLVES", 20)
-    figure = paper.paper_solve_speedup()
-    assert figure.target == 300.0
-    assert figure.value > 30.0  # one noisy round; the bench itself is where 300 is asked for
-
-
 def test_unlike_solutions_of_the_papers_problem_are_no_figure(monkeypatch):
     monkeypatch.setattr(paper, "MAX_RELATIVE_DIFFERENCE", 1e-12)
     with pytest.raises(AssertionError, match="apart"):

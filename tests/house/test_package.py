@@ -35,9 +35,6 @@ PUBLIC = (
         )
     ),
 )  # fmt: skip
-CALLER = """from soilbus.terra.vehicle import GRAVITY
-wrong: str = GRAVITY
-"""
 
 
 def described_constants(module: ModuleType) -> set[str]:
@@ -183,22 +180,3 @@ def test_the_sdist_has_changelog_and_citation(built: Path) -> None:
     with tarfile.open(sdist) as package:
         names = {name.partition("/")[2] for name in package.getnames()}
     assert {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md", "service/soilbus/py.typed"} <= names
-
-
-def test_a_type_checker_of_a_caller_sees_our_types(built: Path, tmp_path: Path) -> None:
-    pytest.importorskip("mypy")
-    (wheel,) = built.glob("*.whl")
-    site, caller = tmp_path / "site", tmp_path / "caller.py"
-    with zipfile.ZipFile(wheel) as package:
-        package.extractall(site)
-    caller.write_text(CALLER)
-    command = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path / "cache"), "--config-file", "", str(caller)]
-    paths = [str(site), *(path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path)]
-    checked = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, capture_output=True, text=True,
-        timeout=300.0,
-    )  # fmt: skip
-    (error, summary) = checked.stdout.splitlines()
-    assert error.startswith("caller.py:2: error: Incompatible types in assignment")
-    assert 'has type "float", variable has type "str"' in error
-    assert "in 1 file" in summary
