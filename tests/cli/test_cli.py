@@ -133,17 +133,6 @@ def test_a_mistake_in_the_configuration_is_one_clear_line_and_exit_code_2(overri
     assert any(all(part in line for part in says) for line in err), err
 
 
-def test_a_driven_wheel_without_speed_is_a_fault(tmp_path, capsys):
-    key, text = "speed", FIELD.read_text()
-    cut = next(line for line in text.splitlines() if line.startswith(f'{key} = "') and "FL" in line)
-    shutil.copy(FIELD.with_name("field.dbc"), tmp_path)
-    (tmp_path / "c.toml").write_text(text.replace(cut + "\n", ""))
-    assert main(["check", "--config", str(tmp_path / "c.toml")]) == 2
-    err = lines(capsys)[1]
-    assert len(err) == 1
-    assert "wheel FL has no speed: map wheel.FL.speed or axle.front.motor_speed" in err[0]
-
-
 def test_a_byte_order_mark_before_a_configuration_is_no_part_of_it(tmp_path, capsys):
     assert main(["check", "--config", str(TRACTOR)]) == 0
     plain = lines(capsys)
@@ -278,16 +267,6 @@ def test_without_a_window_of_use_the_outputs_are_kept_and_one_line_says_why(log,
         assert printed[1] == f"of use: 0 valid, 0 with a doubtful estimate; of no use: {n}"
         assert len(err) == 1
         assert why in err[0]
-
-
-def test_report_is_one_page_with_its_picture_inside(log, tractor, tmp_path, capsys):
-    pytest.importorskip("matplotlib", reason="the extra `plots` is not installed")
-    out = tmp_path / "report.html"
-    assert main(["replay", "--config", str(tractor), str(log), "--report", str(out)]) == 0
-    page = out.read_text()
-    assert "data:image/png;base64," in page
-    assert re.findall("https?:", page) == []
-    assert page.count("<tr>") == 1 + 4
 
 
 def test_deere_logs_never_claim_to_know(field_recording, tmp_path, capsys):

@@ -159,11 +159,6 @@ def test_a_name_that_is_nearly_right_is_asked_for(override, words, capsys):
     assert all(word in err for word in words), err
 
 
-def test_a_soil_that_is_nearly_right_is_asked_for(tmp_path, capsys):
-    assert main(["simulate", "--soil", "lome", "--log", str(tmp_path / "x.log")]) == 1
-    assert "no soil is named lome; did you mean loam?" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("key", ["mass", "cg_ahead_of_rear_axle"])
 def test_a_deviation_that_is_given_twice_is_refused(key):
     with pytest.raises(ConfigError, match=rf"{key} = {{ value, std }} and \w+_std are the same"):

@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).resolve().parents[1]
-LATER: tuple[str, ...] = ()
-"""Folders that do not keep to it yet."""
-FILES = sorted(path for path in TESTS.rglob("*.py") if path.relative_to(TESTS).parts[0] not in LATER)
+FILES = sorted(TESTS.rglob("*.py"))
 
 
 def imports(text: str) -> Iterator[tuple[str, str]]:
@@ -63,7 +61,3 @@ def test_such_an_import_is_found(line: str, fault: str) -> None:
 
 def test_vocabulary_may_be_imported() -> None:
     assert faults("from soilbus.terra.soils import KINDS, SOILS\nfrom numpy import _core, NAN") == []
-
-
-def test_folders_that_are_left_out_are_there() -> None:
-    assert all((TESTS / folder).is_dir() for folder in LATER)
