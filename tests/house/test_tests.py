@@ -57,7 +57,3 @@ def test_no_tuning_value_and_no_private_name_is_imported(path: Path) -> None:
 def test_such_an_import_is_found(line: str, fault: str) -> None:
     (found,) = faults(line)
     assert found.startswith(fault)
-
-
-def test_vocabulary_may_be_imported() -> None:
-    assert faults("from soilbus.terra.soils import KINDS, SOILS\nfrom numpy import _core, NAN") == []
