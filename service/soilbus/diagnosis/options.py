@@ -1,6 +1,6 @@
 """Options of the diagnosis: its tuning values, each once, with unit and source or evidence.
 
-    Record.options -> diagnose -> Search, verdict, where, delays
+Record.options -> diagnose -> Search, verdict, where, delays
 """
 
 from __future__ import annotations

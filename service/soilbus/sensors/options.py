@@ -1,7 +1,7 @@
 """Options of what becomes of samples, and of the sensors' consistency: each value once, with its unit and evidence.
 
-    ReceptionOptions   -> Intake, Bins, outliers, rates
-    ConsistencyOptions -> consistency.implausible, decision.driveline
+ReceptionOptions   -> Intake, Bins, outliers, rates
+ConsistencyOptions -> consistency.implausible, decision.driveline
 """
 
 from __future__ import annotations
