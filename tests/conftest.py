@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
@@ -17,10 +18,12 @@ import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
-IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/test_demo.py")
+IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/cli/test_demo.py")
 """What waits for a bus, a guest kernel or a service most of the time."""
 
 
+hypothesis.settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=50)
+hypothesis.settings.load_profile("seeded")
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # below nohup it is ignored, also by the processes that tests start
 
 

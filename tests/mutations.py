@@ -179,17 +179,17 @@ MUTATIONS = (
     Mutation(
         "the state follows from the pull alone", "decision/judgement.py",
         "state=state_of(min(pull, depth), status, settings)", "state=state_of(pull, status, settings)",
-        ("tests/test_traversability.py::test_ground_that_holds_the_pull_but_not_the_depth_is_no_go",),
+        ("tests/decision/test_traversability.py::test_ground_that_holds_the_pull_but_not_the_depth_is_no_go",),
     ),
     Mutation(
         "a margin makes being pushed harder", "decision/judgement.py",
         "settings.margin * max(demand.pull, 0.0)", "settings.margin * abs(demand.pull)",
-        ("tests/test_traversability.py::test_the_margin_counts_for_pulling_only",),
+        ("tests/decision/test_traversability.py::test_the_margin_counts_for_pulling_only",),
     ),
     Mutation(
         "a margin makes being pushed easier", "decision/judgement.py",
         "settings.margin * max(demand.pull, 0.0)", "settings.margin * demand.pull",
-        ("tests/test_traversability.py::test_the_margin_counts_for_pulling_only",),
+        ("tests/decision/test_traversability.py::test_the_margin_counts_for_pulling_only",),
     ),
     Mutation(
         "PDU format 240 has a destination", "can/j1939.py",

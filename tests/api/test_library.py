@@ -304,25 +304,6 @@ def test_replay_without_pandas_is_a_list_of_rows(monkeypatch, drive):
         soilbus.replay("none.log", TRACTOR)
 
 
-def test_a_found_effect_closes_the_gap_of_another_drive(tmp_path):
-    first, second = tmp_path / "first.log", tmp_path / "second.log"
-    for seed, log in enumerate((first, second), 1):
-        soilbus.simulate(log, duration=40.0, effects={"slip_sinkage": 0.5}, seed=seed)
-    found = soilbus.diagnose(first, TRACTOR)
-    assert (found.verdict, list(found.effects)) == ("named", ["slip_sinkage"])
-    assert repr(found).startswith("an effect is missing, and the data tell which: slip_sinkage (gap ")
-    record = found.to_dict()
-    json.dumps(record, allow_nan=False)
-    assert record["gap"]["before"] == found.gap[0] > 1.3 > found.gap[1]
-    assert record["effects"][0]["probability"] == found.effects["slip_sinkage"]
-    assert found.report().startswith("named: ")
-    found.write_model(tmp_path / "with.toml")
-    after = soilbus.diagnose(second, soilbus.load_config(tmp_path / "with.toml"))
-    assert (after.verdict, after.effects) == ("none", {})
-    with pytest.raises(ValueError, match="give the path of the TOML file"):
-        after.write_model(tmp_path / "no.toml")
-
-
 def test_simulated_drives_are_the_same_for_the_same_seed():
     one, again, other = (soilbus.simulate(soil=["loam", "wet_clay"], duration=4.0, seed=s) for s in (3, 3, 4))
     assert np.array_equal(one.truth["draft"], again.truth["draft"])

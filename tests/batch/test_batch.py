@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 
 import fsspec
-import numpy as np
 import pytest
 
 import soilbus
@@ -152,19 +151,6 @@ def test_a_stopped_batch_goes_on_to_the_same_bytes(client, jobs, done, tmp_path)
     assert files(out) == files(done[1])
 
 
-def test_a_log_repaired_is_read_again(client, config, logs, moved, tmp_path):
-    log = tmp_path / "red" / "a.log"
-    log.parent.mkdir()
-    shutil.copy(logs / "blue/cut.log", log)
-    own = jobs_of(config, "t", [str(log)], no_other)
-    assert run_batch(client, own, tmp_path / "out").errors
-    log.write_text(moved(40.0))
-    batch = run_batch(client, own, tmp_path / "out")
-    assert (batch.failed_before, batch.errors) == (0, [])
-    assert batch.windows == 5
-    assert run_batch(client, own, tmp_path / "out").resumed == 1
-
-
 def test_a_good_log_that_changed_is_read_again(client, config, moved, tmp_path):
     changed, same, url = tmp_path / "red/a.log", tmp_path / "red/b.log", "memory://changed/c.log"
     changed.parent.mkdir()
@@ -296,21 +282,6 @@ def test_logs_come_by_glob_url_and_parquet_manifest(config, logs, tmp_path):
     names = [str(logs / "r*" / "*.log"), f"file://{logs}/blue/w*.log", str(tmp_path / "m.parquet")]
     found = [(job.vehicle, Path(job.log).name) for job in jobs_of(config, "t", names, no_other)]
     assert found == [("blue", "whole.log"), ("red", "midnight.log"), ("red", "morning.log"), ("x", "morning.log")]
-
-
-def test_a_url_and_a_log_sent_along_give_the_windows_of_a_path(client, config, logs, tmp_path, monkeypatch):
-    content = (logs / "blue/whole.log").read_bytes()
-    with fsspec.open("memory://fleet/whole.log", "wb") as file:
-        file.write(content)
-    monkeypatch.setattr("soilbus.offline.batch.unseen_of", lambda folders: list(folders))
-    url, path = "memory://fleet/whole.log", str(logs / "blue/whole.log")
-    run_batch(client, jobs_of(config, "t", [url, path, "memory://fleet/none.log"], no_other), tmp_path / "out")
-    windows = pd.read_parquet(tmp_path / "out/windows")
-    one, other = (windows[windows.log == log]["bearing_pressure.value"].to_numpy() for log in (url, path))
-    assert len(one) == 5
-    assert np.array_equal(one, other)
-    errors = pd.read_parquet(tmp_path / "out/errors.parquet")
-    assert list(errors.fault) == ["memory://fleet/none.log: no such file"]
 
 
 def test_a_configuration_that_fits_no_log_is_one_line(client, config, logs, tmp_path):

@@ -80,7 +80,7 @@ def test_memory_does_not_grow_with_a_log(moved, tractor, tmp_path):
     short, long = tmp_path / "short.log", tmp_path / "long.log"
     short.write_text("".join(moved(9.0 * n) for n in range(4)))
     with long.open("w") as out:
-        for n in range(40):
+        for n in range(24):
             out.write(moved(9.0 * n))
     command = [sys.executable, "-c", MEMORY, tractor, str(short), str(long)]
     run = subprocess.run(command, capture_output=True, text=True, timeout=120.0, check=True, env=os.environ)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cantools.database.can import Database
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.can.admission import Admission
@@ -248,7 +248,6 @@ def test_the_same_counter_with_another_payload_is_a_second_sender_at_once() -> N
     assert reasons_of(frames) == ["", "", "bad_counter", "", "", "bad_counter", *["second_sender"] * 4, "", ""]
 
 
-@settings(derandomize=True, max_examples=100, deadline=None)
 @given(st.integers(1, 3), st.integers(2, 14), st.integers(1, 60))
 def test_whoever_mixes_into_a_message_with_a_counter_of_its_own_is_found_in_any_batches(rate, ahead, split) -> None:
     """Up to twice as many frames as the true sender's; counters run on for both."""
@@ -265,7 +264,6 @@ def test_whoever_mixes_into_a_message_with_a_counter_of_its_own_is_found_in_any_
     assert "second_sender" in said[20:50]
 
 
-@settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.integers(0, 31))
 def test_any_flipped_bit_of_a_guarded_frame_is_refused(bit: int) -> None:
     a = admission(("Guarded", "Value"), checked=["Guarded"])
@@ -343,7 +341,6 @@ def test_group_that_the_dbc_gives_to_several_sources_goes_by_identifier() -> Non
     assert a.can_filters() == [{"can_id": SPEED, "can_mask": 0x1FFFFFFF, "extended": True}]
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 30), st.sampled_from([1, 2, 3])), max_size=30))
 def test_lock_never_mixes_sources_within_its_silence(steps: list[tuple[int, int]]) -> None:
     lock, t, heard = SourceLock(own=1), 0, (None, -math.inf)
@@ -385,7 +382,6 @@ def passes(filters: list[dict[str, Any]], identifier: int, extended: bool) -> bo
     return any(f["extended"] == extended and identifier & f["can_mask"] == f["can_id"] & f["can_mask"] for f in filters)
 
 
-@settings(derandomize=True, max_examples=100, deadline=None)
 @given(st.data())
 def test_filters_pass_exactly_what_is_filed(data: st.DataObject) -> None:
     a = admission(LEFT, ("GroundSpeed", "Speed"), ("Exact", "Value"))

@@ -11,10 +11,10 @@ from pathlib import Path
 import can
 import pytest
 
+from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus, ask_for_buffer, open_bus
 from soilbus.can.publish import Frame
 from soilbus.daemon.bus_health import health_text
-from tests.lab.fakes import FakeClock, ScriptedBus
 
 FRAME = Frame(0x18FF609A, True, bytes(8))
 SO_RCVBUFFORCE = 33

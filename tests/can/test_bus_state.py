@@ -5,9 +5,9 @@ from __future__ import annotations
 import can
 import pytest
 
+from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import LiveBus
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
-from tests.lab.fakes import FakeClock, ScriptedBus
 
 CONTROLLER, PROTOCOL, NO_ACK, BUS_OFF, BUS_ERROR, RESTARTED, COUNTERS = 0x4, 0x8, 0x20, 0x40, 0x80, 0x100, 0x200
 

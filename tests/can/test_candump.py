@@ -9,7 +9,7 @@ from itertools import chain
 
 import can
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from soilbus.can.candump import Frame, candump_batches, frame_of, whole
@@ -62,7 +62,6 @@ def peer(text: str) -> tuple[list[Frame], type[Exception] | None, str]:
     return found[0], ValueError, "its lines have no time stamps: record with candump -L, or candump -ta"
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(plain_lines | any_lines | odd_lines, max_size=20))
 @example(["(1.0) c#n 123#00\n", "(1.0) c(n 123#00\n", "(1.0) can) 123#00\n"])
 @example(["(1.0) c#n 123#00\n"])
@@ -71,7 +70,6 @@ def test_frames_equal_those_of_python_can(lines: list[str]) -> None:
     assert outcome(candump_frames(lines)) == peer("".join(lines))
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(plain_lines | garbage, max_size=10), st.booleans())
 @example([PLAIN, "can0 12A#00\n", PLAIN], False)
 @example([PLAIN, "\n", "(1) can0 12\n", "c1c 012# 1#00\n"], False)
@@ -81,7 +79,6 @@ def test_garbage_gives_the_same_frames_and_then_the_same_error(lines: list[str],
     assert outcome(candump_frames(io.StringIO(text))) == peer(text)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(plain_lines, min_size=1, max_size=20))
 def test_plain_lines_do_not_need_python_can(lines: list[str]) -> None:
     with pytest.MonkeyPatch.context() as patch:

@@ -5,25 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from crccheck.crc import Crc8SaeJ1850
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.can.checksum import column_checksums, crc8, frame_checksum
-
-quick = settings(derandomize=True, max_examples=100, deadline=None)
 
 
 def test_published_check_value() -> None:
     assert crc8(b"123456789") == 0x4B
 
 
-@quick
 @given(st.binary(max_size=70))
 def test_equals_crccheck(data: bytes) -> None:
     assert crc8(data) == Crc8SaeJ1850.calc(data)
 
 
-@quick
 @given(st.integers(0, 2**29 - 1), st.binary(min_size=1, max_size=64), st.data())
 def test_covers_everything_but_its_own_byte(arbitration_id: int, data: bytes, draw: st.DataObject) -> None:
     own = draw.draw(st.integers(0, len(data) - 1))
@@ -36,7 +32,6 @@ def test_covers_everything_but_its_own_byte(arbitration_id: int, data: bytes, dr
     assert frame_checksum(arbitration_id ^ 1 << draw.draw(st.integers(0, 28)), data, own) != due
 
 
-@quick
 @given(st.lists(st.integers(0, 2**29 - 1), min_size=1, max_size=5), st.integers(1, 64), st.data())
 def test_columns_equal_single_frames(ids: list[int], length: int, draw: st.DataObject) -> None:
     rows = [draw.draw(st.binary(min_size=length, max_size=length)) for _ in ids]

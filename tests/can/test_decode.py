@@ -10,13 +10,11 @@ import pytest
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion, LinearConversion
 from cantools.database.errors import DecodeError
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from field_data import FIELD, field_database, frames_of, needs_field
 from soilbus.can.decode import ColumnDecoder
-
-thorough = settings(derandomize=True, max_examples=100, deadline=None)
 
 SCALES = st.one_of(
     st.sampled_from([1, 1.0, 2, 3, -1, -2.0, 0.1, 0.001, 0.05, 1e-9, -0.25, 10**10, 2**40, 1 / 3]),
@@ -104,7 +102,6 @@ def assert_equal_to_cantools(message: Message, rows: list[bytes]) -> None:
                 assert same(column.raw[i : i + 1].tolist()[0], raw[name]), (name, row)
 
 
-@thorough
 @given(st.data())
 def test_equals_cantools(data: st.DataObject) -> None:
     message = data.draw(messages())
@@ -116,7 +113,6 @@ def signal(name: str, start: int, length: int, **more: Any) -> Signal:
     return Signal(name, start, length, conversion=conversion, **more)
 
 
-@thorough
 @given(st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=8))
 def test_nested_multiplexers_equal_cantools(rows: list[bytes]) -> None:
     outer = {"multiplexer_signal": "Outer"}

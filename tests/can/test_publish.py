@@ -6,7 +6,7 @@ from pathlib import Path
 import cantools
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.can.publish import Publisher, value_codes
@@ -32,7 +32,6 @@ def saturates(signal):
     return "Saturates" in signal.dbc.attributes
 
 
-@settings(derandomize=True, deadline=None, max_examples=150)
 @given(st.data())
 def test_every_value_comes_back_within_resolution_or_as_a_code(data):
     message, signal = data.draw(st.sampled_from(SENT))
@@ -120,7 +119,6 @@ def bitwise_crc(data):
     return register ^ 0xFF
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
 @given(st.sampled_from(DATABASE.messages), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=8))
 def test_checksum_covers_identifier_and_payload(message, values):
     names = [s.name for m, s in SENT if m is message]
@@ -190,7 +188,6 @@ def test_codes_of_a_foreign_dbc_follow_the_habits_of_the_field():
     assert (codes["Falling"].code(100), codes["Falling"].code(-50), codes["Falling"].code(None)) == (0, 150, 255)
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
 @given(st.sampled_from(SENT), st.lists(NUMBERS, min_size=1, max_size=20))
 def test_columns_and_single_values_get_the_same_codes(sent, values):
     codes = value_codes(sent[1])

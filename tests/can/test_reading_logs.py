@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bz2
-import gzip
 import lzma
 import struct
 import subprocess
@@ -33,14 +32,14 @@ def packed_lines(pack: Callable[..., object]) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         with pack(path, "wb") as file:  # type: ignore[attr-defined]
             file.write(LINE * 200)
-            file.write(BLANKS * 600)
+            file.write(BLANKS * 300)
 
     return write
 
 
 def zstd_lines(path: Path) -> None:
     with pa.output_stream(path, compression="zstd") as file:
-        file.write(LINE * 200 + BLANKS * 600)
+        file.write(LINE * 200 + BLANKS * 300)
 
 
 def blf_of(containers: int, mebibytes: int) -> Callable[[Path], None]:
@@ -64,11 +63,10 @@ def blf_of(containers: int, mebibytes: int) -> Callable[[Path], None]:
         (packed_lines(lzma.open), "unpacks to more than 250 times its size"),
         (packed_lines(bz2.open), "unpacks to more than 250 times its size"),
         (zstd_lines, "unpacks to more than 250 times its size"),
-        (packed_lines(gzip.open), "unpacks to more than 250 times its size"),
         (blf_of(64, 4), "unpacks to more than 250 times its size"),
         (blf_of(1, 80), "a block of more than 64 MiB"),
     ],
-    ids=["xz", "bzip2", "zstd", "gzip", "containers", "container"],
+    ids=["xz", "bzip2", "zstd", "containers", "container"],
 )
 def test_a_small_log_that_unpacks_to_much_is_refused_in_little_memory(
     write: Callable[[Path], None], reason: str, tmp_path: Path

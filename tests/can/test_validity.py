@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.can.admission import Admission
@@ -100,7 +100,6 @@ def test_top_codes_of_a_standard_group_are_no_values_whatever_range_the_dbc_has(
         assert {why for _, why in out.refused} == ({reason} if reason else set())
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
 @given(
     st.sampled_from([8, 12, 16, 24, 32]),
     st.booleans(),

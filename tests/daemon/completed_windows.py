@@ -26,7 +26,7 @@ from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.trials.bench.on_log import seconds_of_windows
 
-SECONDS = 17.0
+SECONDS = 14.0
 VALUE, STD = 0.05, 0.1
 """In prior std of each parameter."""
 EFFECTS = tuple(name for name, effect in CATALOGUE.items() if not effect.of_record)

@@ -9,12 +9,12 @@ import can
 import pytest
 from j1939 import ControllerApplication, ElectronicControlUnit, Name
 
+from fakes import Bench, drive_messages
 from soilbus.can.dbc_files import output_database
 from soilbus.can.j1939 import name_of
 from soilbus.config.model import J1939, ConfigError
 from soilbus.daemon.address_claim import AddressClaim
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import Bench, drive_messages
 
 ADDRESS = 0x9A
 OURS = J1939(address_claim=True, manufacturer_code=1000, identity_number=7)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import can
 
+from fakes import Bench, FakeClock
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.wire import Received
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import Bench, FakeClock
 
 FULL_BUS = 7500.0
 PAGE = 4096

@@ -11,6 +11,7 @@ import can
 import numpy as np
 import pytest
 
+from fakes import feed_message
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -27,7 +28,6 @@ from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
-from tests.lab.fakes import feed_message
 
 REAR_DRIVEN = reference_configuration(path=REFERENCES["tractor-2wd"])
 TWO_MOTORS = reference_configuration(path=REFERENCES["tractor-axles"])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fakes import feed_message
 from soilbus.can.dbc_files import load_databases
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traversability import State, Status, Traversability
@@ -19,7 +20,6 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from tests.lab.fakes import feed_message
 from tests.lab.stories.onlooker import good_tracked, of_soft_ground, tracked_at
 
 CONFIG = reference_configuration()

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from fakes import feed_message
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import parse_config
 from soilbus.decision.capability import assess
@@ -28,7 +29,6 @@ from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
 from soilbus.trials.windows import bins_of
-from tests.lab.fakes import feed_message
 
 TRUTH = reference_configuration(path=REFERENCES["tractor-2wd"])
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "estimation"))
+from driven_windows import tasks
 from soilbus.decision.traversability import Status
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
-from tests.lab.driven_windows import tasks
 
 FORMLESS = [f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")]
 

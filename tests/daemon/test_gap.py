@@ -23,7 +23,7 @@ MINUTE = 60.0
 
 def results(effects):
     """Window results of a drive with effects that the configuration does not know of."""
-    config = reference_configuration([f"estimator.max_prediction_error={LIMIT}"])
+    config = reference_configuration([f"estimator.max_prediction_error={LIMIT}", "estimator.hop=2.0"])
     hidden = effects_of(with_effects(config, effects))
     recording = simulate(config, excited("loam", SECONDS), 4, hidden)
     rig, length = rig_of(config), config.estimator.window

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 import can
 import pytest
 
+from fakes import Bench, FakeClock, HeldExecutor, drive_messages
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.daemon.health import Health
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import Bench, FakeClock, HeldExecutor, drive_messages
 
 WINDOW = 8.0
 CONFIG = reference_configuration([f"estimator.window={WINDOW}"])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fakes import feed_message
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config, machine, parse_config
@@ -18,7 +19,6 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from tests.lab.fakes import feed_message
 
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 START = 1_700_000_000.0

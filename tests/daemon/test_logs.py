@@ -135,7 +135,7 @@ logs_drawn = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=logs_drawn)
 def test_any_sequence_of_logs_gives_the_windows_of_each_and_accounts_for_every_sample(drawn, drive, tmp_path):
     logs, sent = [], 0

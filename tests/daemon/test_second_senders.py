@@ -10,6 +10,7 @@ import can
 import numpy as np
 import pytest
 
+from fakes import Bench, drive_messages
 from soilbus.can.candump import frame_of
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases
@@ -18,7 +19,6 @@ from soilbus.cli.main import main
 from soilbus.daemon.notify import Notifier
 from soilbus.sensors.survey import survey
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import Bench, drive_messages
 
 CONFIG, DURATION = reference_configuration(), 16.0
 MOTOR = load_databases(CONFIG).get_message_by_name("MotorFL").frame_id

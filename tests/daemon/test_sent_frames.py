@@ -13,6 +13,7 @@ from pathlib import Path
 import can
 import pytest
 
+from fakes import drive_messages
 from soilbus.can.dbc_files import output_database
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -22,7 +23,6 @@ from soilbus.offline.replay import read_log
 from soilbus.offline.sent_frames import sent_frames
 from soilbus.simulator.play import send_in_time
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from tests.lab.fakes import drive_messages
 
 DURATION = 16.0
 DATABASE = output_database(reference_configuration())

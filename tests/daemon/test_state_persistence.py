@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fakes import Bench, FakeClock, HeldExecutor, InlineExecutor, ScriptedBus, drive_messages
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner, read
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import Bench, FakeClock, HeldExecutor, InlineExecutor, ScriptedBus, drive_messages
 
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)

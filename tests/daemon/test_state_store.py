@@ -11,8 +11,6 @@ import operator
 import os
 import re
 import signal
-import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -75,7 +73,7 @@ def sealed(change) -> bytes:
     return json.dumps(raw).encode()
 
 
-@settings(deadline=None, derandomize=True, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31))
 def test_what_comes_back_is_bit_for_bit_what_was_stored(seed):
     gaussian = belief_with(seed)
@@ -86,7 +84,6 @@ def test_what_comes_back_is_bit_for_bit_what_was_stored(seed):
         assert np.array_equal(getattr(back, part), getattr(gaussian, part))
 
 
-@settings(deadline=None, derandomize=True, max_examples=150)
 @given(st.integers(0, len(CONTENT) - 1), st.integers(0, 255), st.booleans())
 def test_one_wrong_byte_or_a_cut_is_noticed(place, byte, cut):
     spoilt = CONTENT[:place] if cut else CONTENT[:place] + bytes([byte]) + CONTENT[place + 1 :]
@@ -104,7 +101,6 @@ JSON = st.recursive(
 )
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
 @given(st.binary(max_size=200) | JSON.map(lambda x: json.dumps(x).encode()))
 def test_no_bytes_are_a_traceback(content):
     with pytest.raises(StateError):
@@ -124,7 +120,6 @@ STRANGE = [None, True, 0, -1, 1e308, -1e308, 5e-324, -0.0, math.nan, math.inf, 2
 
 
 @pytest.mark.filterwarnings("error")
-@settings(deadline=None, derandomize=True, max_examples=200)
 @given(st.lists(st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE) | JSON), min_size=1, max_size=3))
 def test_nothing_that_is_sealed_well_is_a_traceback(edits):
     def edit(state):
@@ -376,20 +371,6 @@ def test_a_kill_at_any_step_leaves_the_old_file_or_the_new(step, call, done, new
     write_whole(path, CONTENT)
     assert [p.name for p in tmp_path.iterdir()] == ["state.json"]
     assert path.read_bytes() == CONTENT
-
-
-def test_fifty_kills_lose_nothing_that_was_stored(tmp_path: Path):
-    killer = Path(__file__).with_name("killed.py")
-    environment = {**os.environ, "PYTHONPATH": str(killer.parents[2] / "service")}
-    done = subprocess.run(
-        [sys.executable, killer, tmp_path / "state.json", "50", "1"],
-        capture_output=True, text=True, env=environment, timeout=120.0,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    told = json.loads(done.stdout)
-    assert told["kills"] == 50
-    assert told["broken"] == told["lost"] == 0
-    assert told["written"] > 50
 
 
 def test_a_pipe_in_the_place_of_the_new_file_halts_nobody(tmp_path: Path):

@@ -9,8 +9,8 @@ from time import perf_counter, sleep
 import numpy as np
 import pytest
 
+from fakes import FakeClock, HeldExecutor, InlineExecutor
 from soilbus.daemon.work_queue import WorkQueue
-from tests.lab.fakes import FakeClock, HeldExecutor, InlineExecutor
 
 
 def test_results_come_in_their_order_with_their_ends():

@@ -170,7 +170,7 @@ int main(void) {{
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", ["soilbus", "tractor"])
 def test_generated_c_code_compiles_and_decodes_as_cantools(name, tmp_path):
     from soilbus.can.checksum import frame_checksum
 

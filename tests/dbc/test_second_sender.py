@@ -12,7 +12,7 @@ from typing import NamedTuple
 import can
 import cantools
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from availability import unavailable
@@ -176,7 +176,6 @@ strangers = st.lists(
 story = st.lists(st.tuples(states, st.integers(1, 12)), min_size=2, max_size=8)
 
 
-@settings(derandomize=True, max_examples=150, deadline=None)
 @given(story, strangers, st.integers(0, 15))
 def test_no_interleaving_with_a_stranger_shows_go_against_soilbus(shown, said_by_us, steps, phase):
     spans = ["go"] * 8 + [state for state, n in said_by_us for _ in range(n)]

@@ -61,7 +61,7 @@ def rich() -> Found:
     return found(driven(RICH, 1))
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5])
 def test_an_even_drive_says_that_it_could_not_have_shown_what_it_hides(seed):
     """Wheels that dig, at one slip only, are a softer soil: the pressure is a sixth off, reported to 0.5 %."""
     reported, shown = found(driven(STEADY, seed, "slip_sinkage=1.0"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import islice
 
+from fleet import Fault, fleet
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.estimation.assembly import prior_of
@@ -13,7 +14,6 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.catalogue import CATALOGUE
 from tests.lab.blind.cases import cases
 from tests.lab.blind.trial import record_of_case
-from tests.lab.fleet import Fault, fleet
 
 PRIOR = prior_of(reference_configuration())
 TYRE = CATALOGUE["tyre_deflection"]

@@ -60,7 +60,7 @@ def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
 numbers = st.floats(0.001, 0.3)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(numbers, numbers, st.lists(st.sampled_from(["FL", "FR", "RL", "RR"]), unique=True, min_size=1))
 def test_values_and_stds_read_back(tmp_path_factory, value, std, wheels):
     tables = [

@@ -6,6 +6,13 @@ import math
 
 import pytest
 
+from published_wheels import (
+    configuration,
+    diagnosed,
+    lugs_beside_a_shifted_peak,
+    records_of,
+    strain,
+)
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
@@ -16,13 +23,6 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-from tests.lab.published_wheels import (
-    configuration,
-    diagnosed,
-    lugs_beside_a_shifted_peak,
-    records_of,
-    strain,
-)
 
 TESTED_PHI = math.radians(31.9)
 """Friction angle of the soil of Ding et al. 2011, from their shear tests."""

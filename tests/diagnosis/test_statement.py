@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.diagnosis.detectable import Detectable
@@ -71,7 +71,6 @@ def said(found: Diagnosis) -> str:
     return "\n".join([statement(found), doubt(found) or "", *place_lines(findings), *shown_lines(found, CONFIG)])
 
 
-@settings(max_examples=400, deadline=None)
 @given(diagnoses())
 def test_no_sentence_contradicts_another(found):
     text = said(found)
@@ -81,7 +80,6 @@ def test_no_sentence_contradicts_another(found):
     assert (headline(found) == "Model and data agree") == agrees
 
 
-@settings(max_examples=300, deadline=None)
 @given(diagnoses())
 def test_a_gap_that_is_left_is_said_in_the_first_line(found):
     is_unexplained = found.verdict is Verdict.UNKNOWN or found.gap_after.exceeds_noise()
@@ -89,7 +87,6 @@ def test_a_gap_that_is_left_is_said_in_the_first_line(found):
     assert len(statement(found).splitlines()) == 1
 
 
-@settings(max_examples=300, deadline=None)
 @given(diagnoses())
 def test_unknown_beside_names_says_that_these_are_there_and_more(found):
     if found.verdict is Verdict.UNKNOWN and found.additions:

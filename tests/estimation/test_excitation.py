@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
+import driven_windows
+from driven_windows import tasks
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
@@ -17,8 +19,6 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.trials.draft_trials import true_largest_draft
 from soilbus.trials.draws import prior_about
-from tests.lab import driven_windows
-from tests.lab.driven_windows import tasks
 
 STILL, LEANING, ROCKING = Swing(0.0, 1e-9), Swing(-0.3, 0.3), Swing(-0.3, 0.3, 0.2, 0.4)
 SLIPS = (0.05, 0.1, 0.2, 0.35)
@@ -64,20 +64,6 @@ def test_constant_driving_has_right_intervals(sinkage, soil):
     assert ((rms > 0.8 * low) & (rms < 1.25 * high)).all(), rms
 
 
-@pytest.mark.parametrize("soil", driven_windows.NAMES)
-def test_minutes_of_constant_driving_stay_right(soil):
-    last = []
-    for seed in range(2):
-        config = rough(soil, "estimator.hop=5.0")
-        scenario = Scenario(80.0, (Patch(0.0, soil),), slip=driven_windows.constant(SLIPS[seed + 1]), side_shift=STILL)
-        estimator = WindowEstimator(config)
-        results = [estimator.estimate(task).result for task in tasks(config, scenario, seed)]
-        last += [deviations(r.posterior, soil) for r in results[-6::5] if r.posterior is not None]
-    assert len(last) == 4
-    assert np.abs(last).max() < 3.0
-    assert np.sqrt(np.mean(np.square(last), axis=0)).max() < 1.6  # two windows of a drive share gains: few errors
-
-
 # --- what is missing ---
 
 
@@ -106,7 +92,7 @@ def largest_draft(soil):
 @pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "dry_sand"])
 def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
     narrower = []
-    for seed in range(1, 4):
+    for seed in (1, 2):
         short = said(soil, driven_windows.EXCITED, STILL, sinkage=False, seconds=5.0, seed=seed)
         assert short.status is Status.NOT_EXCITED
         assert "load_range" in short.reason.split()
@@ -126,7 +112,7 @@ def between(one, other):
     return np.sqrt(wide * narrow)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else(seed):
     def drives(*overrides):
         shifts = (STILL, LEANING)
@@ -138,8 +124,7 @@ def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else(seed)
     assert (varied.status, varied.reason) == (Status.VALID, "none")
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("soil", ["loam", "lete_sand", "sandy_loam_23_michigan"])
+@pytest.mark.parametrize(("soil", "seed"), [("loam", 1), ("lete_sand", 2), ("sandy_loam_23_michigan", 1)])
 def test_varied_loads_with_constant_slip_lack_a_range_of_slips(soil, seed):
     def drives(*overrides):
         slips = (driven_windows.constant(0.05), driven_windows.EXCITED)

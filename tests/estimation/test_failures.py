@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import driven_windows
+from driven_windows import tasks
 from soilbus.can.dbc_files import load_databases
 from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.estimator import WindowEstimator
@@ -15,8 +17,6 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.report.windows import summary
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
-from tests.lab import driven_windows
-from tests.lab.driven_windows import tasks
 
 CONFIG = reference_configuration()
 BAD = 10

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from driven_windows import task_of, tasks
 from other_wheel import Contact, readings
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
@@ -17,7 +18,6 @@ from soilbus.pipeline.outputs import json_line
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
-from tests.lab.driven_windows import task_of, tasks
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
 CONFIG = reference_configuration()
@@ -39,19 +39,24 @@ def off_and_std(result, soil):
     return np.log(np.array(value) / truth), np.array(std)
 
 
+def contacts(rng, rounds):
+    """Each kind of soil under so many contacts."""
+    for i in range(rounds * len(KINDS)):
+        form = Contact(rng.uniform(0.18, 0.5), rng.uniform(0.0, 0.32), rng.uniform(0.0, 0.17), bool(i % 2))
+        yield soil_named(KINDS[i % len(KINDS)]), form
+
+
 def test_intervals_hold_the_truth_whatever_the_form_of_the_contact():
     rng = np.random.default_rng(2)
     inside = {config: [] for config in ("with", "without")}
-    for i in range(24):
-        soil = soil_named(KINDS[i % len(KINDS)])
-        contact = Contact(rng.uniform(0.18, 0.5), rng.uniform(0.0, 0.32), rng.uniform(0.0, 0.17), bool(i % 2))
+    for soil, contact in contacts(rng, 2):
         task = window_on(soil, contact, rng)
-        for name, config in (("with", CONFIG), ("without", FORMLESS))[: 1 if i % 3 else 2]:
+        for name, config in (("with", CONFIG), ("without", FORMLESS)):
             result = WindowEstimator(config).solve(task)
             if result.posterior is not None:
                 off, std = off_and_std(result, soil)
                 inside[name].append(np.abs(off) < 1.96 * std)
-    assert len(inside["with"]) >= 20
+    assert len(inside["with"]) >= 10
     assert (np.mean(inside["with"], axis=0) >= 0.88).all()
     assert np.mean(inside["without"], axis=0)[0] < np.mean(inside["with"], axis=0)[0] - 0.4
 
@@ -59,9 +64,7 @@ def test_intervals_hold_the_truth_whatever_the_form_of_the_contact():
 def test_without_sinkage_sensors_intervals_hold_the_pressure_whatever_the_form_of_the_contact():
     rng = np.random.default_rng(4)
     found = []
-    for i in range(24):
-        soil = soil_named(KINDS[i % len(KINDS)])
-        contact = Contact(rng.uniform(0.18, 0.5), rng.uniform(0.0, 0.32), rng.uniform(0.0, 0.17), bool(i % 2))
+    for soil, contact in contacts(rng, 4):
         result = WindowEstimator(CONFIG).solve(window_on(soil, contact, rng, sinkage=False))
         found.append((*off_and_std(result, soil), result.status is Status.VALID))
     off, std, valid = (np.array(column) for column in zip(*found, strict=True))

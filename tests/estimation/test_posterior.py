@@ -27,7 +27,7 @@ def draws(posterior: Posterior, n: int) -> np.ndarray:
     return np.exp(logs)
 
 
-@settings(derandomize=True, deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(value=st.floats(1e-3, 1e6), share=st.floats(0.01, 1.0))
 def test_prior_is_log_normal_with_that_median_and_coefficient_of_variation(value, share):
     prior = SoilPrior.from_value_std(dict.fromkeys(PARAMETERS, (value, share * value)))

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
@@ -115,7 +115,6 @@ def test_a_descent_ends_at_its_least_value_where_evaluations_are_used_up_or_the_
 
 
 @given(st.integers(0, 10_000), st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=4, max_size=4))
-@settings(max_examples=60, deadline=None)
 def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_optimum(seed, sides):
     rng = np.random.default_rng(seed)
     root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)

@@ -7,10 +7,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from cramer_rao import cramer_rao
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior, tyre_modulus
 from soilbus.terra.soils import SOILS
-from tests.lab.cramer_rao import cramer_rao
 
 CLAY = SOILS["wet_clay"]
 TRUTH = np.asarray(CLAY)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from driven_windows import errors, tracker_of, windows
 from soilbus.can.channels import Column, Decoded
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config
@@ -35,7 +36,6 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel
-from tests.lab.driven_windows import errors, tracker_of, windows
 
 CRAWLER = Path(__file__).parents[1] / "field" / "tracked.toml"
 WITH_CELLS = (
@@ -234,22 +234,6 @@ def test_intervals_hold_on_soils_drawn_from_the_prior(swing, cells):
     assert rms[judged].max() < 1.6
 
 
-@pytest.mark.parametrize("name", ["dry_sand", "loam"])
-def test_at_constant_load_cohesion_stays_as_uncertain_as_before(name):
-    """Nothing in a minute of it tells c from tan phi; loads of one value plus noise seemed to."""
-    config = crawler(*WITH_CELLS, "estimator.hop=10")  # windows that share no sample
-    prior, ground = prior_of(config), replace(pulling(name, 60.0), side_shift=Swing(0.0, 0.0))
-    tracker, away = tracker_of(config), []
-    for window, end in windows(config, simulate(config, ground, seed=3)):
-        fit = tracker.estimate(window, end).fit
-        assert fit is not None
-        away.append(errors(fit.posterior, SOILS[name])[1])
-    assert len(away) == 6
-    assert np.abs(away).max() < 2.0
-    c = PARAMETERS.index("c")
-    assert np.sqrt(fit.posterior.log_covariance[c, c]) > 0.8 * prior.log_std[c]
-
-
 def results_of(config, ground, seed=3):
     """What the pipeline says of a drive, second by second."""
     recording, pipeline = simulate(config, ground, seed), Pipeline(config, load_databases(config))
@@ -262,15 +246,6 @@ def results_of(config, ground, seed=3):
         pipeline.intake.add(Decoded(part))
         results += pipeline.advance(since + 1.0)
     return results
-
-
-def test_a_crawler_at_constant_load_has_a_valid_estimate():
-    ground = replace(pulling("dry_sand", 20.0), side_shift=Swing(0.0, 0.0))
-    results = results_of(crawler(*WITH_CELLS), ground)
-    assert len(results) >= 8
-    valid = [result for result in results if result.status is Status.VALID]
-    assert valid
-    assert max(abs(errors(result.posterior, SOILS["dry_sand"])[1]) for result in valid) < 2.0
 
 
 @pytest.mark.parametrize("name", ["loam", "dry_sand"])

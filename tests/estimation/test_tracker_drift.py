@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from driven_windows import B_REF, Z_REF, errors, task_of, tracker_of, windows
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.measurements import gain_names
@@ -18,7 +19,6 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited, soil_along
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from tests.lab.driven_windows import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
 CONFIG = reference_configuration(["estimator.hop=10.0"])
 LENGTH = CONFIG.estimator.window

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from driven_windows import errors, tracker_of, windows
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.last_run import prior_from_last_run
@@ -16,7 +17,6 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from tests.lab.driven_windows import errors, tracker_of, windows
 
 GAIN_CORRELATION_TIME = 86400.0
 """A gain error forgets all but 1/e in a day [s]."""

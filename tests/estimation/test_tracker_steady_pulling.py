@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from driven_windows import tasks
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.pipeline.estimator import WindowEstimator
@@ -12,7 +13,6 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.trials.draft_trials import true_largest_draft
-from tests.lab.driven_windows import tasks
 
 CONFIG = reference_configuration()
 STEADY = {"speed": Profile([0, 90], [1.4, 1.4])}

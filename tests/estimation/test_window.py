@@ -51,7 +51,6 @@ def channel(window, name):
     return getattr(window, quantity)[column], window.variance[quantity][column]
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
 @given(seed=SEED, name=st.sampled_from(RIG.channels), origin=st.sampled_from([0.0, -3.7, EPOCH]))
 def test_means_variances_and_counts_are_those_of_the_samples(seed, name, origin):
     rng = np.random.default_rng(seed)
@@ -76,7 +75,6 @@ def test_means_variances_and_counts_are_those_of_the_samples(seed, name, origin)
         assert np.isnan(channel(window, other)[0]).all()
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
 @given(seed=SEED, rate=st.floats(12.0, 200.0), slope=st.floats(-5.0, 5.0))
 def test_a_linear_signal_is_exact_at_the_centres_whatever_the_phase(seed, rate, slope):
     rng = np.random.default_rng(seed)
@@ -103,7 +101,6 @@ def test_linear_beside_a_gap_and_plain_mean_of_a_lonely_bin():
     assert window.draft == pytest.approx(expected, nan_ok=True)
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
 @given(seed=SEED, origin=st.sampled_from([0.0, 0.37, EPOCH, EPOCH + 0.123456]), on_border=st.booleans())
 def test_every_sample_is_in_exactly_one_of_disjoint_windows(seed, origin, on_border):
     rng = np.random.default_rng(seed)
@@ -122,7 +119,7 @@ def test_every_sample_is_in_exactly_one_of_disjoint_windows(seed, origin, on_bor
         assert not share[counts == 0].any()
 
 
-@settings(derandomize=True, deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=SEED, pieces=st.integers(1, 9))
 def test_order_and_batches_of_samples_do_not_matter(seed, pieces):
     rng = np.random.default_rng(seed)

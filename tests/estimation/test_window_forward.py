@@ -142,22 +142,6 @@ def test_an_unknown_axle_does_not_count():
     assert turning(window, TRACTOR, MAX_TURN).tolist() == [True, False, False, False, False]
 
 
-@pytest.mark.parametrize("front", [[True], [False], [True, False], [True] * 4, [True, False, False, False]])
-def test_without_an_axle_of_two_wheels_nothing_turns(front):
-    speed = np.array([[1.0, 3.0, 5.0, 7.0], [1.0, 1.0, 1.0, 1.0]])[:, : len(front)]
-    window = dataclasses.replace(few(np.ones((2, 4))), speed=speed)
-    assert turning(window, rig(front), MAX_TURN).tolist() == [False, False]
-    beside = rig([*front[:1], not front[0], not front[0]])  # one wheel here, two there: those count
-    window = dataclasses.replace(window, speed=np.array([[1.0, 3.0, 5.0], [1.0, 1.0, 1.0]]))
-    assert turning(window, beside, MAX_TURN).tolist() == [True, False]
-
-
-def test_slip_and_side_slopes_of_straight_driving_are_no_turns(simulated):
-    for name in ("loam", "clayey_soil_38", "wet_clay"):
-        case = simulated(SOILS[name], 22)
-        assert not turning(case.window, case.rig, MAX_TURN).any()
-
-
 def test_a_sharp_turn_does_harm_and_is_left_out(simulated):
     off = []
     side = np.array([1.0, -1.0, 1.0, -1.0])

@@ -100,8 +100,3 @@ def test_a_missing_extra_is_named_before_the_work(option, name, extra, tmp_path,
     assert capsys.readouterr().err.endswith(f" needs the extra soilbus[{extra}]\n")
     extras = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     assert extra in extras["optional-dependencies"]
-
-
-def test_a_folder_that_is_not_there_is_named_before_the_work(tmp_path, capsys):
-    assert main(["replay", "--config", str(TRACTOR), "no.log", "--table", str(tmp_path / "no" / "w.csv")]) == 1
-    assert capsys.readouterr().err == f"soilbus: {tmp_path}/no/w.csv: no folder {tmp_path}/no\n"

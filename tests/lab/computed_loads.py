@@ -17,6 +17,7 @@ from itertools import product
 
 import numpy as np
 
+from monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE
 from soilbus.arrays import Array
 from soilbus.config.model import Axle, Config, Signal
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
@@ -30,7 +31,6 @@ from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import soil_named
 from soilbus.trials.draws import prior_about, processes
 from soilbus.trials.windows import bins_of
-from tests.lab.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE
 
 CELLS = ("cells", "axle cells", "none")
 """Load cells of the wheels, of the axles, of neither."""

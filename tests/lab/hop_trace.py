@@ -31,8 +31,6 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
-__all__ = ["HopTrace", "hop_trace", "traced"]
-
 PACKAGE = str(Path(soilbus.__file__).parent)
 WARM_HOPS = 10
 """Windows solved before the traced one: one window's length of hops, after which no datum of the first is left."""

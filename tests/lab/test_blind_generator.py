@@ -21,7 +21,6 @@ from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
 from tests.lab.blind import outside
 from tests.lab.blind.cases import FORMS, KINDS, SOILS, Case, cases
-from tests.lab.blind.command import main
 from tests.lab.blind.form import Form, Setting
 from tests.lab.blind.rim import rim_forces
 
@@ -113,24 +112,6 @@ def test_nothing_is_hidden_in_nulls(kind):
     assert {(case.hidden, case.forms, case.size) for case in nulls} == {((), (), "")}
     for case in (shorter(case, 4.0) for case in nulls[:4]):
         assert alike(case.recording, simulate(case.config, case.scenario, case.seed))
-
-
-def test_harsh_drives_are_harsh():
-    def jerk(kind: str) -> float:
-        return max(float(np.abs(np.diff(shorter(c, 20.0).recording.truth["acceleration"])).max()) for c in few(kind))
-
-    def few(kind: str) -> list[Case]:
-        return list(cases(kind, 1))[:3]
-
-    assert jerk("hard") > 4.0 * jerk("plain")
-
-
-def test_loads_shake_where_they_shall():
-    def swing(kind: str) -> float:
-        loads = [shorter(c, 20.0).recording.truth["load.RR"] for c in list(cases(kind, 1))[:3]]
-        return float(np.mean([np.std(np.diff(load) / load[1:]) for load in loads]))
-
-    assert swing("shaking") > 4.0 * swing("plain")
 
 
 @pytest.mark.parametrize("form", [*FORMS, *outside.FORMS], ids=titles((*FORMS, *outside.FORMS)))
@@ -253,12 +234,3 @@ def test_what_the_catalogue_imitates_is_marked(form, standard):
     ]
     left = [nearest(name, signature(how.effects[0], standard), standard) for name in alike]
     assert (min(left, default=1.0) < 0.8) == form.imitable, dict(zip(alike, left, strict=True))
-
-
-def test_the_command_lists_and_drives(capsys):
-    assert main(["--seed", "2", "--list"]) == 0
-    listed = capsys.readouterr().out.splitlines()
-    assert len(listed) == sum(1 for kind in KINDS for _ in cases(kind, 2))
-    assert any("tune" in line for line in listed)
-    with pytest.raises(ValueError, match="known: single, pair"):
-        next(cases("triple", 1))

@@ -46,7 +46,7 @@ RECORDS = st.lists(
 )  # fmt: skip
 
 
-@settings(derandomize=True, deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.too_slow])
 @given(RECORDS)
 def test_frames_with_any_stamp_are_counted_and_end(records):
     data = b"".join(bytes(head) + payload for *head, payload in records)

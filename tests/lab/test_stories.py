@@ -14,7 +14,7 @@ from soilbus.pipeline.states import ServiceState
 from tests.lab.stories.drives import cheap, real
 from tests.lab.stories.story import TO_ALL, TO_SOME, Event, begin, drawn, end, played
 
-ENOUGH, HEALED = 60, 10
+ENOUGH, HEALED = 30, 10
 """Stories that find out each service without a check; every tenth is told until go is due again."""
 
 
@@ -26,7 +26,7 @@ def quiet():
     logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize(("machine", "stories"), [("tractor", ENOUGH), ("tractor-2wd", 10), ("tractor-axles", 10)])
+@pytest.mark.parametrize(("machine", "stories"), [("tractor", ENOUGH), ("tractor-2wd", 5), ("tractor-axles", 5)])
 def test_go_is_said_where_the_truth_allows_it_and_nowhere_else(machine, stories):
     go = 0
     for seed in range(stories):
@@ -38,9 +38,7 @@ def test_go_is_said_where_the_truth_allows_it_and_nowhere_else(machine, stories)
     assert go > 10 * stories
 
 
-@pytest.mark.parametrize(
-    ("machine", "seeds"), [("tractor", range(4)), ("tractor-2wd", (0, 10)), ("tractor-axles", (0, 4))]
-)
+@pytest.mark.parametrize(("machine", "seeds"), [("tractor", (2, 3)), ("tractor-2wd", (10,)), ("tractor-axles", (4,))])
 def test_an_estimator_that_is_given_nothing_says_no_more_than_the_truth(machine, seeds):
     go = 0
     for seed in seeds:

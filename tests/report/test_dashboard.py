@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from fakes import FakeClock
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
@@ -22,7 +23,6 @@ from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.text_charts import area, bar, sparkline
 from soilbus.report.watch import page
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import FakeClock
 
 SIZES = [(80, 24), (120, 40), (200, 60)]
 SMALLER = [(79, 24), (72, 20), (71, 24), (80, 19), (40, 12), (20, 6), (9, 3)]

@@ -21,6 +21,7 @@ import can
 import pytest
 from rich.console import Console
 
+from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import output_database
 from soilbus.can.log_writer import write_log
@@ -29,7 +30,6 @@ from soilbus.report.dashboard import Dashboard
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.watch import PlayedLog, show
 from soilbus.simulator.reference import reference_configuration
-from tests.lab.fakes import FakeClock, ScriptedBus
 
 DATABASE = output_database(reference_configuration())
 BEGIN = 1.7e9

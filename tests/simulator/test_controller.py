@@ -140,13 +140,6 @@ def test_a_strangers_set_points_are_not_followed():
     assert max(spoofed.drafts[60:]) <= spoofed.drafts[59] + 1.0
 
 
-@pytest.mark.parametrize("slip", [0.10, 0.20, 0.26])
-def test_over_both_soils_it_pulls_more_than_at_a_constant_slip_that_suits_neither_best(followed, slip):
-    constant = drive(CONFIG, replace(ONTO_CLAY, draft=None, slip=Swing(slip, slip)), SEED)
-    assert mean_draft(followed) > mean_draft(constant) + 100.0
-    assert mean_draft(followed, "wet_clay") > mean_draft(constant, "wet_clay") + 100.0
-
-
 def test_a_constant_draft_bogs_down_there_or_pulls_less(followed):
     mean = mean_draft(followed)
     as_much = drive(CONFIG, replace(ONTO_CLAY, draft=Swing(mean, mean)), SEED)

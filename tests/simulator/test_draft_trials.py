@@ -41,11 +41,11 @@ def test_figures_of_trials_that_have_them():
 
 
 def test_the_largest_draft_is_predicted_on_held_soils():
-    found = list(draft_trials(CONFIG, 8, 3))
+    found = list(draft_trials(CONFIG, 5, 3))
     assert [f.soil for f in found] == [*SOILS, "all"]
     assert all(f.error < 0.05 and f.failed == 0 for f in found)
-    assert found[-1].drives == 24
-    assert 0.86 <= found[-1].coverage <= 1.0  # the command looks closer: 24 drives scatter by 5 points
+    assert found[-1].drives == 15
+    assert 0.86 <= found[-1].coverage <= 1.0  # the command looks closer: 15 drives scatter by 6 points
     assert trial(Task(CONFIG, SOILS[0], 5)) == trial(Task(CONFIG, SOILS[0], 5))
 
 

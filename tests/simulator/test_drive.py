@@ -155,19 +155,6 @@ def test_a_weak_motor_limits_the_draft():
     assert weak["torque.RL"].max() < 1000.0 * (1 + 1e-8) < weak["torque.RR"].max()
 
 
-def test_the_demo_is_easy_on_loam_and_too_much_for_wet_clay():
-    columns = drive(config(), demo(60.0), seed=1).columns
-    loam, clay = (columns["soil"] == name for name in ("loam", "wet_clay"))
-    assert 0.4 < loam.mean() < 0.6
-    assert (loam | clay).all()
-    assert columns["draft"][loam][:-150] == pytest.approx(columns["demand"][loam][:-150], rel=1e-9)
-    assert columns["slip.FL"][loam][:-150].max() < 0.35
-    on_clay = clay & (columns["distance"] > columns["distance"][clay][0] + 3.0)
-    assert columns["demand"][on_clay].min() > 1.5 * columns["draft"][on_clay].max()
-    assert columns["slip.FL"][on_clay].min() > 0.45
-    assert np.median(columns["sinkage.FL"][on_clay]) > 2.0 * np.median(columns["sinkage.FL"][loam])
-
-
 def test_rear_wheels_reach_the_next_soil_a_wheelbase_later():
     soils = (Patch(0.0, "loam"), Patch(15.0, "clayey_soil_38"))
     flat = {"speed": Swing(1.5, 1.5), "side_shift": Swing(0.0, 0.0), "slip_spread": 0.0, "transition": 0.01}

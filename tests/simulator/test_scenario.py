@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise, soil_along, soil_names
 from soilbus.terra.soils import soil_named
 
 
-@settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.integers(0, 10**6), st.floats(-5.0, 5.0), st.floats(0.0, 10.0), st.floats(2.0, 150.0))
 def test_waves_stay_in_range_with_exact_rate_and_integral(seed, low, span, duration):
     t = np.linspace(0.0, duration, 5001)

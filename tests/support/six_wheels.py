@@ -9,8 +9,6 @@ from typing import Any
 from soilbus.config.file import machine, parse_config
 from soilbus.config.model import Config
 
-__all__ = ["MIDDLE", "PLACES", "six_wheels"]
-
 MIDDLE = 1.5
 """Distance of the middle axle ahead of the rear one [m], of 2.4 m between the first and the last."""
 PLACES = {"front": 2.4, "middle": MIDDLE, "rear": 0.0}

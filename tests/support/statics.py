@@ -7,16 +7,6 @@ from scipy.optimize import brentq
 
 from soilbus.terra.wheel import Soil, WheelModel, state_on, wheel_forces
 
-__all__ = [
-    "MODEL",
-    "WEIGHT",
-    "WHEELS",
-    "axles",
-    "brute",
-    "brute_with_rolling",
-    "wheel",
-]
-
 MODEL = WheelModel()
 WEIGHT = 2300.0 * 9.80665
 WHEELS = [0, 0, 1, 1]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
@@ -33,7 +33,6 @@ def test_normal_stress_is_bekkers_and_nothing_above_the_ground():
     assert normal_stress(7e5, 1.0, 0.03) == pytest.approx(21e3, rel=1e-12)
 
 
-@settings(derandomize=True, deadline=None)
 @given(entry=st.floats(0.05, 1.2), part=st.floats(-0.5, 1.0), slip=st.floats(-0.5, 0.95))
 def test_shear_displacement_integrates_the_slip_velocity(entry, part, slip):
     # eq. 15: the rim moves at r omega - V cos(theta) against the soil; dt = d theta / omega
@@ -62,7 +61,6 @@ def test_shear_laws_at_known_points():
 
 
 @pytest.mark.parametrize("law", SHEAR_LAWS.values(), ids=SHEAR_LAWS)
-@settings(derandomize=True, deadline=None)
 @given(ratio=RATIOS, other=RATIOS)
 def test_shear_laws_are_odd_bounded_and_rising(law, ratio, other):
     share, slope = law(ratio)

@@ -210,33 +210,6 @@ def on_loam(angle, slip, **changed):
     return state_on(SOILS["loam"], angle, slip, R, B, L)._replace(**changed)
 
 
-@pytest.mark.parametrize("law", MEAN_SHEAR)
-def test_without_slip_there_is_no_thrust_and_the_resistance_is_left(law):
-    W, DP, T = wheel_forces(on_loam(0.4, 0.0), WheelModel(law))
-    soil, z = SOILS["loam"], float(sinkage(0.4, R))
-    assert T == 0.0
-    assert pytest.approx(-W * z / (L * (soil.n + 1.0)), rel=1e-12) == DP
-
-
-def test_a_small_shear_modulus_mobilises_all_strength():
-    state = on_loam(0.4, 1.0, K=1e-9)
-    W, _, T = wheel_forces(state, WheelModel())
-    assert pytest.approx(R * (B * L * state.c + W * state.tan_phi), rel=1e-8) == T
-
-
-def test_a_long_track_needs_less_slip():
-    """Of two tracks of one area under one load, the longer one has the greater thrust: u = s L / K."""
-    long = on_loam(0.4, 0.1, length=2.0 * L, width=B / 2.0)
-    assert wheel_forces(long, WheelModel())[2] > wheel_forces(on_loam(0.4, 0.1), WheelModel())[2]
-
-
-@given(st.floats(0.05, 1.0), st.floats(-0.5, 0.9), st.sampled_from(sorted(MEAN_SHEAR)))
-def test_load_grows_with_sinkage_and_pull_with_slip(angle, slip, law):
-    angles, slips = angle * np.array([1.0, 1.01]), slip + np.array([0.0, 0.01])
-    assert np.diff(wheel_forces(on_loam(angles, slip), WheelModel(law))[0]) > 0.0
-    assert np.diff(wheel_forces(on_loam(angle, slips), WheelModel(law))[1]) > 0.0
-
-
 @given(st.floats(1e3, 2e5), st.floats(-0.3, 0.8), st.sampled_from(sorted(SOILS)), st.sampled_from([np.nan, 0.3]))
 def test_the_entry_angle_carries_the_load(load, slip, name, guess):
     soil = SOILS[name]

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required, slip_ratio, wheel_loads
@@ -22,7 +22,6 @@ def test_standing_tractor():
     assert rear == pytest.approx(2300.0 * 9.80665 * 1.00 / 1.95, rel=1e-12)
 
 
-@settings(derandomize=True, deadline=None)
 @given(**SIDES)
 def test_loads_balance_forces_and_moments_about_any_point(draft, pitch, acceleration):
     front, rear = axle_loads(TRACTOR, draft, pitch, acceleration)
@@ -76,7 +75,6 @@ def test_slip_is_unknown_where_the_wheel_does_not_turn_forward_or_a_reading_is_m
     assert np.isnan(slip_ratio(0.5, speed, ground)).all()
 
 
-@settings(derandomize=True, deadline=None)
 @given(
     between=st.lists(st.floats(0.05, 1.9), max_size=2, unique=True).map(lambda x: sorted(x, reverse=True)),
     each=st.integers(1, 2),

@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from scipy.integrate import quad
 
 from adaptive import adaptive_forces
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -175,58 +174,6 @@ def test_derivatives_of_a_skidding_wheel(name):
         assert miss.max() < most
 
 
-def test_more_slip_pulls_more_until_the_shear_is_mobilised():
-    slip = np.linspace(-0.3, 0.95, 60)
-    for soil in SOILS.values():
-        _, DP, T = wheel_forces(state_on(soil, 0.3, slip, R, B), WheelModel())
-        assert np.all(np.diff(T) > 0.0)  # at one depth: more displacement everywhere along the rim
-        assert np.all(np.diff(DP) > 0.0)
-
-
-def test_without_cohesion_all_forces_grow_in_proportion_to_the_modulus():
-    soil = SOILS["dry_sand"]._replace(c=0.0, k_c=0.0)
-    base = wheel_forces(state_on(soil, 0.3, 0.2, R, B), WheelModel())
-    twice = wheel_forces(state_on(soil._replace(k_phi=2.0 * soil.k_phi), 0.3, 0.2, R, B), WheelModel())
-    assert twice == pytest.approx(2.0 * base, rel=1e-13)
-
-
-def test_cohesion_alone_gives_its_shear_over_the_rim():
-    # No friction, fully mobilised: tau = c all along the contact, so T = r^2 b c theta1 exactly.
-    state = WheelState(0.4, 0.3, R, B, 5e5, 0.8, 0.0, 4e3, 1e-7)
-    bare = wheel_forces(state._replace(c=0.0), WheelModel())
-    cohesive = wheel_forces(state, WheelModel(nodes=60)) - bare
-    by_hand = [R * B * 4e3 * (1.0 - math.cos(0.4)), R * B * 4e3 * math.sin(0.4), R * R * B * 4e3 * 0.4]
-    assert cohesive == pytest.approx(by_hand, rel=1e-4)
-    assert bare[2] == 0.0
-
-
-def test_a_small_shear_modulus_mobilises_all_friction():
-    state = WheelState(0.4, 0.3, R, B, 5e5, 0.8, 0.5, 0.0, 0.02)
-    W, DP, T = (
-        quad(lambda t, f=f: f(t), 0.2, 0.4)[0] + quad(lambda t, f=f: f(t), 0.0, 0.2)[0] for f in _fully_mobilised(state)
-    )
-    forces = wheel_forces(state._replace(K=1e-6), WheelModel(nodes=60))
-    assert forces == pytest.approx([W, DP, T], rel=1e-3)
-    shares = [wheel_forces(state._replace(K=K), WheelModel())[2] / T for K in (0.1, 0.01, 0.001, 0.0001)]
-    assert np.all(np.diff(shares) > 0.0)
-    assert 0.95 < shares[-1] < 1.0
-
-
-def _fully_mobilised(state):
-    """W, DP and T densities with tau = sigma tan phi, the small rotation of eqs. 5-9 written out."""
-    theta1, _, r, b, K_L, n, tan_phi, _, _, _ = state
-
-    def sigma(t):
-        front = max(t, theta1 - t)  # c1 = 1/2: the rear mirrors the front
-        return K_L * (r * (math.cos(front) - math.cos(theta1))) ** n if front < theta1 else 0.0
-
-    return (
-        lambda t: r * b * sigma(t) * (math.cos(t) + tan_phi * math.sin(t)),
-        lambda t: r * b * sigma(t) * (tan_phi * math.cos(t) - math.sin(t)),
-        lambda t: r * r * b * sigma(t) * tan_phi,
-    )
-
-
 def test_scalars_and_broadcasting():
     scalar = WheelState(0.3, 0.2, R, B, 5e5, 0.8, 0.4, 3e3, 0.02)
     grid = scalar._replace(entry_angle=np.linspace(0.1, 0.5, 4)[:, None], slip=np.linspace(-0.2, 0.5, 5))
@@ -276,7 +223,6 @@ ANY_SOIL = st.builds(
 LAWS = st.sampled_from([WheelModel(), WheelModel("rational"), WheelModel(nodes=FAST_NODES), WheelModel(peak_c2=0.3)])
 
 
-@settings(max_examples=150, derandomize=True, deadline=None)
 @given(
     soil=SOIL | ANY_SOIL,
     angle=st.floats(0.01, 1.2),
@@ -294,7 +240,6 @@ def test_entry_angle_carries_the_load_of_a_driven_wheel(soil, angle, slip, radiu
     assert found == pytest.approx(angle, rel=1e-7)  # driven, load grows with depth: there is one answer
 
 
-@settings(max_examples=120, derandomize=True, deadline=None)
 @given(
     soil=SOIL | ANY_SOIL, load=st.floats(100.0, 3e4), slip=st.floats(-0.3, 0.0), guess=st.floats(1e-6, 1.39), model=LAWS
 )
@@ -308,7 +253,6 @@ def test_entry_angle_carries_the_load_of_a_skidding_wheel(soil, load, slip, gues
     assert carried == pytest.approx(load, rel=1e-9)
 
 
-@settings(max_examples=120, derandomize=True, deadline=None)
 @given(
     load=st.floats() | st.sampled_from([0.0, -1.0, math.nan, math.inf, -math.inf, 1e300, 1e-300]),
     slip=st.floats(-1.0, 1.0),

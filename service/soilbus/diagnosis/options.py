@@ -1,8 +1,6 @@
 """Options of the diagnosis: its tuning values, each once, with unit and source or evidence.
 
-    Record.options -> diagnose -> Search, verdict, where, delays
-
-What a change of 30 % does to each is in service/docs/sensitivity.md.
+Record.options -> diagnose -> Search, verdict, where, delays
 """
 
 from __future__ import annotations

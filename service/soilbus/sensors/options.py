@@ -1,9 +1,7 @@
 """Options of what becomes of samples, and of the sensors' consistency: each value once, with its unit and evidence.
 
-    ReceptionOptions   -> Intake, Bins, outliers, rates
-    ConsistencyOptions -> consistency.implausible, decision.driveline
-
-What a change of 30 % does to each is in service/docs/sensitivity.md.
+ReceptionOptions   -> Intake, Bins, outliers, rates
+ConsistencyOptions -> consistency.implausible, decision.driveline
 """
 
 from __future__ import annotations
@@ -101,7 +99,7 @@ class ConsistencyOptions:
     faults less are found."""
     jump_explained: float = 0.25
     """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
-    fifteen faults of the accelerometer are taken for jumps (`tests.lab.sensitivity`)."""
+    fifteen faults of the accelerometer are taken for jumps."""
 
 
 CONSISTENCY = ConsistencyOptions()

@@ -29,16 +29,6 @@ from tests.lab.blind import (
 from tests.lab.blind.form import SIZES, Form, Hidden, Setting, together
 from tests.lab.computed_loads import FIELD_BOUNCE
 
-__all__ = [
-    "DURATION",
-    "FORMS",
-    "KINDS",
-    "SOILS",
-    "Case",
-    "cases",
-    "half_of",
-]
-
 KINDS = ("single", "pair", "outside", "plain", "hard", "shaking")
 """One effect of the catalogue, two of them, one that it lacks, none, none in harsh conditions, and none on ground over
 which loads shake by FIELD_BOUNCE."""

@@ -19,14 +19,6 @@ from tests.lab.blind.bound import bound
 from tests.lab.blind.cases import Case
 from tests.lab.blind.visible import Shown, shown
 
-__all__ = [
-    "FAILED",
-    "NOTHING",
-    "Trial",
-    "record_of_case",
-    "tried",
-]
-
 
 @dataclass(frozen=True)
 class Trial:

@@ -10,14 +10,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-__all__ = [
-    "RECORD",
-    "STEPS",
-    "Fed",
-    "Known",
-    "frames_of",
-]
-
 RECORD = 12
 STEPS = (
     0.0, 1e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.3, 1.0, 2.5, 70.0, 3600.0, -1e-3, -0.3, -0.9, -1.5, -10.0,

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from cantools.database import Database
 
+from fakes import FakeClock, InlineExecutor
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -18,18 +19,9 @@ from soilbus.daemon.warm_up import warm_up
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
-from tests.lab.fakes import FakeClock, InlineExecutor
 from tests.lab.soak.figures import Beat, Estimates, Hour, resident_memory, unaccounted
 from tests.lab.soak.traffic import SOIL, traffic_beside
 from tests.lab.soak.wire import Wire
-
-__all__ = [
-    "CYCLE",
-    "HOUR",
-    "SLACK",
-    "Soak",
-    "soak",
-]
 
 HOUR = 3600.0
 CYCLE, JITTER = 0.1, 0.006

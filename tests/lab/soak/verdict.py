@@ -6,12 +6,6 @@ from typing import NamedTuple
 
 from tests.lab.soak.run import CYCLE, SLACK, Soak
 
-__all__ = [
-    "GROWTH",
-    "Demand",
-    "demands",
-]
-
 GROWTH = 1e6
 """Of resident memory [bytes] after the first hour that is allowed."""
 WORSE = 1.3

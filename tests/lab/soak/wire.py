@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import can
 import numpy as np
 
-from tests.lab.fakes import FakeClock
+from fakes import FakeClock
 
 FAULTS = (  # in turns, each round in another order
     "silent", "spoilt", "stuck", "doubled", "late", "short", "remote", "stranger", "error_frames", "no_bus",

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import can
 import numpy as np
 
+from fakes import FakeClock, InlineExecutor, drive_messages, feed_message
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases, output_database
@@ -42,28 +43,6 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.sensors import sensors
 from soilbus.terra.soils import SOILS
-from tests.lab.fakes import FakeClock, InlineExecutor, drive_messages, feed_message
-
-__all__ = [
-    "CONFIG",
-    "CYCLE",
-    "MOMENTS",
-    "WEAK",
-    "Drive",
-    "Handed",
-    "Known",
-    "MadePipeline",
-    "NotingTracker",
-    "TrueTracker",
-    "Wire",
-    "Worker",
-    "fit_of",
-    "good_moment",
-    "good_tracked",
-    "needed_messages",
-    "of_soft_ground",
-    "tracked_at",
-]
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)

@@ -9,17 +9,6 @@ from typing import Any, NamedTuple
 
 from tests.lab.stories.onlooker import WEAK, Drive
 
-__all__ = [
-    "TO_ALL",
-    "TO_GROUND",
-    "TO_SOME",
-    "Event",
-    "begin",
-    "drawn",
-    "end",
-    "played",
-]
-
 LAST = 0.4
 """Seconds of good frames at the end of a story."""
 HEAL = 7.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -89,7 +89,6 @@ def effects_with_values(draw):
     return effect, {p.name: draw(st.floats(p.low, p.high)) for p in effect.parameters}
 
 
-@settings(max_examples=150, deadline=None)
 @given(effects_with_values(), st.sampled_from(["dry_sand", "wet_clay", "heavy_clay_40", "snow_us"]), st.integers(0, 9))
 def test_finite_over_all_of_the_ranges(case, soil, seed):
     effect, values = case
@@ -98,7 +97,6 @@ def test_finite_over_all_of_the_ranges(case, soil, seed):
         assert np.all(np.isfinite(value)), name
 
 
-@settings(max_examples=150, deadline=None)
 @given(effects_with_values(), st.sampled_from(["loam", "wet_clay"]), st.data())
 def test_a_small_step_of_a_parameter_makes_a_small_change(case, soil, data):
     effect, values = case
