@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from driven_windows import task_of, windows
 from soilbus.arrays import Array
 from soilbus.can.channels import Column, Decoded
 from soilbus.can.dbc_files import load_databases
@@ -62,8 +63,7 @@ from soilbus.trials.boggings import KINDS
 from soilbus.trials.firm_drives import EASY, FIRM_KINDS
 from soilbus.trials.windows import bins_of
 from tests.lab.blind.cases import Case, cases
-from tests.lab.driven_windows import task_of, windows
-from tests.lab.watched_drives import Observation, judged, observed
+from watched_drives import Observation, judged, observed
 
 FACTORS = (0.7, 1.3)
 EARTH_RADIUS = 6.378e6

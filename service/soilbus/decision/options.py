@@ -2,7 +2,8 @@
 
     WatchOptions -> watch.watched, moments.moments
 
-What an operator may want to change is in `config.model.Warning`.
+What a change of 30 % does to each is in service/docs/sensitivity.md.  What an operator may want to change is in
+`config.model.Warning`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Options of the diagnosis: its tuning values, each once, with unit and source or evidence.
 
-Record.options -> diagnose -> Search, verdict, where, delays
+    Record.options -> diagnose -> Search, verdict, where, delays
+
+What a change of 30 % does to each is in service/docs/sensitivity.md.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     Rig.options -> Measurements.options -> every function that has a window's problem
 
-What an operator may want to change is in `config.model`.  Numbers that only keep arithmetic finite stand
-where they are used.
+What a change of 30 % does to each is in service/docs/sensitivity.md.  What an operator may want to change is in
+`config.model`.  Numbers that only keep arithmetic finite stand where they are used.
 """
 
 from __future__ import annotations

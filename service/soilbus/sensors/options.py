@@ -1,7 +1,9 @@
 """Options of what becomes of samples, and of the sensors' consistency: each value once, with its unit and evidence.
 
-ReceptionOptions   -> Intake, Bins, outliers, rates
-ConsistencyOptions -> consistency.implausible, decision.driveline
+    ReceptionOptions   -> Intake, Bins, outliers, rates
+    ConsistencyOptions -> consistency.implausible, decision.driveline
+
+What a change of 30 % does to each is in service/docs/sensitivity.md.
 """
 
 from __future__ import annotations
@@ -99,7 +101,7 @@ class ConsistencyOptions:
     faults less are found."""
     jump_explained: float = 0.25
     """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
-    fifteen faults of the accelerometer are taken for jumps."""
+    fifteen faults of the accelerometer are taken for jumps (`tests.lab.sensitivity`)."""
 
 
 CONSISTENCY = ConsistencyOptions()
