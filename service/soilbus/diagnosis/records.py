@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.instants import averaged, instant_of
 from soilbus.estimation.linearisation import Linearisation
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
@@ -139,6 +140,8 @@ def record_of(
     TooLittle
         Where the recording has not enough usable instants.
     """
+    end = float(window.t[-1]) if len(window.t) else 0.0
+    window = averaged(window, end, instant_of(rig, rig.options.tracker.instant))
     problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed, max_turn)
     problem = problem.with_own_stamps().on_curves()
     fold = folds(problem.since, options)

@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.window import TIME_TOLERANCE, VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window
+from soilbus.estimation.window import TIME_TOLERANCE, VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Rig, Window
 
-__all__ = ["averaged"]
+__all__ = ["averaged", "instant_of"]
 
 _QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+
+
+def instant_of(rig: Rig, length: float) -> float:
+    """Return the length [s] of a machine's instants; 0, bins as they are, on tracks: no tyre relaxes or bounces."""
+    lengths = rig.lengths
+    return 0.0 if lengths is not None and (lengths > 0.0).all() else length
 
 
 def averaged(window: Window, end: float, length: float) -> Window:

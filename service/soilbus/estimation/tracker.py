@@ -27,7 +27,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.instants import averaged
+from soilbus.estimation.instants import averaged, instant_of
 from soilbus.estimation.last_run import passes_prior_conflict_test, prior_from_last_run
 from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
@@ -162,9 +162,8 @@ class Tracker:
 
     @property
     def instant(self) -> float:
-        """Length [s] of an instant; 0 (bins as they are) on tracks, where no tyre relaxes or bounces."""
-        lengths = self.rig.lengths
-        return 0.0 if lengths is not None and (lengths > 0.0).all() else self.settings.instant
+        """Length [s] of an instant."""
+        return instant_of(self.rig, self.settings.instant)
 
     @property
     def state(self) -> SoilState:
