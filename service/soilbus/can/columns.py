@@ -70,8 +70,15 @@ def column_database(units: Mapping[str, str]) -> Database:
 
 def mapped_columns(config: Config) -> dict[str, str]:
     """Return the unit of each column that the configuration maps, by its name."""
-    mapped = _signals(config.model_dump(exclude={"columns", "table", "folder"}))
-    return {one["signal"]: one["unit"] if one["unit"] is not None else unit_in(one["signal"]) for one in mapped}
+    return {
+        one["signal"]: one["unit"] if one["unit"] is not None else unit_in(one["signal"])
+        for one in mapped_signals(config)
+    }
+
+
+def mapped_signals(config: Config) -> list[Mapping[str, Any]]:
+    """Return the keys of each signal that the configuration maps."""
+    return list(_signals(config.model_dump(exclude={"columns", "table", "folder"})))
 
 
 def _signals(section: Any) -> Iterator[Mapping[str, Any]]:

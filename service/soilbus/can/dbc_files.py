@@ -12,7 +12,7 @@ from typing import Any
 from cantools.database.can import Database, Message
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
-from soilbus.can.columns import column_database, mapped_columns
+from soilbus.can.columns import column_database, mapped_columns, mapped_signals
 from soilbus.can.dbc_text import check_multiplexers, message_names, of_messages
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
@@ -25,7 +25,6 @@ LARGEST = 32 * 2**20
 """Bytes of a DBC file: five times those of one with 10 000 messages."""
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 """A name in a DBC: C_identifier of the DBC file format (Vector, version 1.0.5), with its greatest length."""
-_SIGNAL = re.compile(r"(\w+)\.\w+")
 
 
 def load_databases(config: Config, mapped_only: bool = False) -> Database:
@@ -42,7 +41,9 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
     if not config.dbc.input:
         faults.append("dbc.input: no DBC file given")
     messages: dict[str, tuple[str, Message]] = {}
-    names = _mapped(config) if mapped_only else None
+    names: set[str] | None = None
+    if mapped_only:
+        names = {*config.dbc.checked, *(one["signal"].partition(".")[0] for one in mapped_signals(config))}
     for name in config.dbc.input:
         try:
             read = _read_named("dbc.input", config.folder, name, names)
@@ -58,18 +59,6 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
     if names is not None and not names <= messages.keys():
         return load_databases(config)  # whoever says what is missing may name what is there
     return _database(message for _, message in messages.values())
-
-
-def _mapped(config: Config) -> set[str]:
-    """Names of the messages that the configuration names: in Message.Signal anywhere, or as to be checked."""
-    found, left = set(config.dbc.checked), [config.model_dump(mode="json", exclude={"dbc", "output", "bus", "folder"})]
-    while left:
-        item = left.pop()
-        if isinstance(item, (dict, list)):
-            left.extend(item.values() if isinstance(item, dict) else item)
-        elif isinstance(item, str) and (signal := _SIGNAL.fullmatch(item)):
-            found.add(signal[1])
-    return found
 
 
 def checked_messages(config: Config, database: Database) -> frozenset[str]:
