@@ -287,7 +287,7 @@ def test_report_is_one_page_with_its_picture_inside(log, tractor, tmp_path, caps
     page = out.read_text()
     assert "data:image/png;base64," in page
     assert re.findall("https?:", page) == []
-    assert page.count("<tr>") == 1 + 4
+    assert "4 windows from" in page
 
 
 def test_deere_logs_never_claim_to_know(field_recording, tmp_path, capsys):

@@ -237,7 +237,7 @@ def _chart(dashboard: Dashboard, name: str, width: int) -> str:
     values = dashboard.history(name, width - LABEL)
     now = next((value for value in reversed(values) if value is not None), None)
     said = "-" if now is None else f"{now * IN_UNITS.get(name, 1.0):.3g}"
-    return f"{CHARTS[name]:<13}{said:>7}  {sparkline(values)}"
+    return f"{CHARTS[name]:<12}{said:>8}  "[:LABEL] + sparkline(values)
 
 
 def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
