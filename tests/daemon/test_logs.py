@@ -202,16 +202,11 @@ def test_every_output_says_which_log_it_is_of(lines, tmp_path, capsys):
     features = json.loads(outputs[1].read_text())["features"]
     assert [f["properties"]["log"] for f in features] == names
     assert len({f["id"] for f in features}) == 20
-    by_log, windows = (
-        re.findall(r"<tr><td>([^<]*)</td>", table)
-        for table in re.findall("(?s)<table>.*?</table>", outputs[2].read_text())
-    )
-    assert by_log == list(dict.fromkeys(names))
-    assert windows == names
-    said = capsys.readouterr().out
+    said, page = capsys.readouterr().out, outputs[2].read_text()
     assert "20 windows from" in said
     for name in set(names):
         assert f"  {name}: 5 windows, " in said
+        assert f"  {name}: 5 windows, " in page
 
 
 def test_names_are_as_short_as_tells_logs_apart():

@@ -110,13 +110,13 @@ def test_text_has_verdict_effect_physics_and_soil(diagnosed):
 
 def test_report_needs_nothing_but_itself(diagnosed):
     report = diagnosed.report
-    assert re.findall('<img alt="residuals (before|after): gap [0-9.]+" src="data:image/png;base64,', report) == [
-        "before",
-        "after",
-    ]
+    found = re.findall(
+        '<img alt="(Before|After): ([a-z]+) measured against modelled" src="data:image/png;base64,', report
+    )
+    assert [when for when, _ in found] == ["Before", "After"] * (len(found) // 2)
+    assert {"torque", "draft"} <= {channel for _, channel in found}
     assert set(re.findall(r"""(?:src|href|url)\s*[=(]\s*['"]?(.{5})""", report)) == {"data:"}
-    assert "Candidates for effect 1" in report
-    assert "<td>multipass</td>" in report
+    assert "1. multipass, probability 1.00" in report
 
 
 def test_model_out_is_the_configuration_with_the_effect(diagnosed):

@@ -145,11 +145,6 @@ class Service:
         """Posterior from which the next window's prior comes; None before there is one."""
         return self._guarded_estimator.newest
 
-    @property
-    def has_open_windows(self) -> bool:
-        """Whether a window has ended that is not solved yet."""
-        return bool(self._work_queue)
-
     def stop(self) -> None:
         """Let `run` return after the present round; safe to call from a signal handler."""
         self._stopping = True

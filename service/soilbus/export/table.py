@@ -54,17 +54,23 @@ def _cell(value: Any) -> Any:
 
 def parquet_of(rows: Rows, columns: Iterable[str] = ()) -> bytes:
     """Return the bytes of a Parquet file, by default of the columns that occur; what is not known is null."""
-    return parquet_of_tables([arrow_table(rows, columns)])
+    return parquet_bytes(arrow_table(rows, columns))
 
 
-def parquet_of_tables(tables: Iterable[Any]) -> bytes:
-    """Return the bytes of a Parquet file of pyarrow tables one below the other; what a table lacks is null."""
-    import pyarrow as pa
+def parquet_bytes(table: Any) -> bytes:
+    """Return the bytes of a Parquet file of a pyarrow table."""
     import pyarrow.parquet as pq
 
     out = io.BytesIO()
-    pq.write_table(pa.concat_tables(tables, promote_options="default"), out)
+    pq.write_table(table, out)
     return out.getvalue()
+
+
+def joined(tables: Iterable[Any]) -> Any:
+    """Return pyarrow tables one below the other as one; what a table lacks is null."""
+    import pyarrow as pa
+
+    return pa.concat_tables(tables, promote_options="default")
 
 
 def table_columns(rows: Iterable[Mapping[str, Any]]) -> list[str]:

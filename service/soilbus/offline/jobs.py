@@ -228,28 +228,19 @@ def _files(log: str, suffixes: Sequence[str]) -> list[str]:
 
 
 def _below(folder: str, suffixes: Sequence[str]) -> list[str]:
-    """What is named as logs are below a folder, behind links too, and each folder that cannot be read."""
+    """What is named as a log below a folder, behind links to elsewhere too, and each folder that cannot be read."""
     found: list[str] = []
-    root = os.path.abspath(folder)
-    walk = os.walk(root, followlinks=True, onerror=lambda error: found.append(error.filename))
+    root, seen = os.path.realpath(folder), set[str]()
+    walk = os.walk(os.path.abspath(folder), followlinks=True, onerror=lambda error: found.append(error.filename))
     for place, folders, names in walk:
-        folders[:] = [name for name in folders if not _is_double(Path(place, name), Path(root))]
-        logs = [Path(place, name) for name in (*folders, *names) if _is_log(name, suffixes)]
-        found += [
-            str(log) for log in logs if not (_is_double(log, Path(root)) and _is_log(log.resolve().name, suffixes))
-        ]
-    return found
-
-
-def _is_double(path: Path, root: Path) -> bool:
-    """Whether this is a link to what is found below `root` anyway, or to a folder that it lies in itself."""
-    if not path.is_symlink():
-        return False
-    target, ends = Path(os.path.realpath(path)), len(root.parents)
-    above = [each for each in path.parents if len(each.parents) >= ends]
-    return target.is_relative_to(os.path.realpath(root)) or any(
-        Path(os.path.realpath(each)).is_relative_to(target) for each in above
-    )
+        paths = {name: os.path.join(place, name) for name in (*folders, *names)}
+        found += [path for name, path in paths.items() if _is_log(name, suffixes)]
+        real = {name: os.path.realpath(paths[name]) for name in folders if os.path.islink(paths[name])}
+        known = {name for name, path in real.items() if path in seen or Path(path).is_relative_to(root)}
+        folders[:] = [name for name in folders if name not in known]
+        seen |= {os.path.realpath(place), *real.values()}
+    own = {path for path in found if not os.path.islink(path)}
+    return [path for path in found if path in own or os.path.realpath(path) not in own]
 
 
 def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:

@@ -79,7 +79,7 @@ class LocalWorkers:
 @contextmanager
 def local_workers(count: int | None = None) -> Iterator[LocalWorkers]:
     """Give processes of this machine, by default one for each core; after an exception nobody waits for them."""
-    with tempfile.TemporaryDirectory(prefix="soilbus-", ignore_cleanup_errors=True) as folder, _one_thread():
+    with tempfile.TemporaryDirectory(prefix="soilbus-", ignore_cleanup_errors=True) as folder:
         client = LocalWorkers(count or len(os.sched_getaffinity(0)), folder)
         try:
             yield client
@@ -87,19 +87,6 @@ def local_workers(count: int | None = None) -> Iterator[LocalWorkers]:
             client.close(wait=False)
             raise
         client.close(wait=True)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """A process that starts meanwhile computes with one thread."""
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    try:
-        yield
-    finally:
-        del os.environ["OMP_NUM_THREADS"]
-        if before is not None:
-            os.environ["OMP_NUM_THREADS"] = before
 
 
 def _begin(folder: str, memory: int) -> None:

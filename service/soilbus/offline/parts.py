@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from io import SEEK_END
+from itertools import compress, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -34,7 +35,7 @@ from soilbus.config.file import located
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
-from soilbus.export.table import arrow_table, parquet_of_tables
+from soilbus.export.table import arrow_table, joined, parquet_bytes
 from soilbus.files import LIMITS, read_bounded
 from soilbus.offline.replay import LogError, OtherBus, log_names, replay
 from soilbus.offline.tables import replay_tables
@@ -51,6 +52,8 @@ CPU_PER_BYTE = 300.0 / 2**20
 7 s a MiB packed by xz; five frames a second with data that repeat, packed by xz, took 1500 s a MiB: 7 kB for 40 min."""
 ROW_GROUP = 2000
 """Windows that are converted at once: 2 MB of columns."""
+COUNTED = ("t", "status", "traversability.state", "bearing_pressure.value")
+"""Columns of the windows that a summary is made of."""
 NO_DAY = "unknown"
 """Day of windows whose log has no dates."""
 
@@ -227,105 +230,80 @@ def local_log(job: Job) -> Iterator[Path]:
 def _replayed(job: Job, path: Path, latest: float) -> Outcome:
     """The outcome; when the thread's clock says `latest` [s] the log is given up."""
     config, database = unpacked(job.setup.content)
-    summary, fault = _Summary(job, config), None
+    fault, shift, window = None, 0.0, config.estimator.window
     pipeline = None if database is None else Pipeline(config, database)
     (label,) = log_names([path])
     tables: list[Any] = []
     rows: list[dict[str, Any]] = []
     try:
-        for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
+        for n, result in enumerate(replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path])):
             run = (result.log or "").removeprefix(label) if pipeline is None else ""  # of a table: its soil bed
             if time.thread_time() > latest:
                 raise LogError(f"{path}: given up: it takes more processor time than a log of its size may")
-            rows.append(summary.row(replace(result, log=job.log + run)))
+            if n == 0 and job.start is not None:
+                shift = job.start - (result.t - window)
+            rows.append(_row(replace(result, log=job.log + run), job, config, shift))
             if len(rows) == ROW_GROUP:
                 tables.append(arrow_table(rows))
                 rows.clear()
     except LogError as error:
         fault = error
     text = None if fault is None else str(fault).replace(str(path), job.log)
-    if summary.windows:
-        part = parquet_of_tables([*tables, arrow_table(rows)])
-        return Outcome(text, summary.record(pipeline, text), part, lasting=fault is not None)
+    if tables or rows:
+        table = joined([*tables, arrow_table(rows)])
+        return Outcome(text, _summary(table, job, config, pipeline, text), parquet_bytes(table), lasting=bool(fault))
     if fault is not None:
         return Outcome(text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting)
-    window = config.estimator.window
     return Outcome(f"{job.log}: no recording in it lasts the {window:g} s of a window", lasting=True)
 
 
-class _Summary:
-    """Counts of one log, window by window."""
+def _row(result: WindowResult, job: Job, config: Config, shift: float) -> dict[str, Any]:
+    """A window as a row; its time is in milliseconds since 1970, None where the stamp is no date."""
+    longitude, latitude = (None, None) if result.position is None else map(math.degrees, reversed(result.position))
+    when = round((result.t + shift) * 1e3) if is_date(result.t + shift) else None
+    day = NO_DAY if when is None else datetime.fromtimestamp(when / 1e3, UTC).date().isoformat()
+    place = {"vehicle": job.vehicle, "day": day, "time": when, "longitude": longitude, "latitude": latitude}
+    return place | flat_record(window_record(result, config))
 
-    def __init__(self, job: Job, config: Config) -> None:
-        self.job, self.config = job, config
-        self.windows = 0
-        self._shift: float | None = None
-        self._counts: Counter[str] = Counter()
-        self._bearing_sum, self._bearing_n = 0.0, 0
-        self._rejected: Counter[str] = Counter()
-        self._times: list[int] = []
-        self._newest = -math.inf
-        self._duration = 0.0
 
-    def row(self, result: WindowResult) -> dict[str, Any]:
-        """The window as a row, counted."""
-        record = flat_record(window_record(result, self.config))
-        longitude, latitude = (None, None) if result.position is None else map(math.degrees, reversed(result.position))
-        when = self._time(result.t)
-        day = NO_DAY if when is None else datetime.fromtimestamp(when / 1e3, UTC).date().isoformat()
-        place = {"vehicle": self.job.vehicle, "day": day, "time": when, "longitude": longitude, "latitude": latitude}
-        self.windows += 1
-        settings = self.config.estimator
-        follows = 0.0 < result.t - self._newest < 1.5 * settings.hop
-        self._duration += settings.hop if follows else settings.window
-        self._newest = result.t
-        self._counts[f"windows.{result.status}"] += 1
-        self._counts[f"windows.{result.traversability.state}"] += 1
-        if result.bearing is not None and result.status is Status.VALID:
-            self._bearing_sum += result.bearing.value
-            self._bearing_n += 1
-        if self.config.table is not None:
-            self._rejected += Counter(result.rejected)
-        if when is not None:  # the clock may be set back
-            self._times = [min([when, *self._times[:1]]), max([when, *self._times[1:]])]
-        return place | record
-
-    def _time(self, t: float) -> int | None:
-        """Milliseconds since 1970; None where the stamp is no date."""
-        if self._shift is None:
-            self._shift = 0.0 if self.job.start is None else self.job.start - (t - self.config.estimator.window)
-        t += self._shift
-        return round(t * 1e3) if is_date(t) else None
-
-    def record(self, pipeline: Pipeline | None, fault: str | None) -> dict[str, Any]:
-        """The whole log in one row."""
-        frames: dict[str, int | None] = {}
-        used, rejected = None, self._rejected
-        if pipeline is not None:
-            counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
-            frames = {
-                "frames.mapped": sum(counts.received.values()),
-                "frames.unknown": counts.unknown,
-                "frames.error": counts.error_frames,
-                "frames.lost": pipeline.admission.missed,
-                "frames.other_channel": counts.elsewhere,
-            }
-            used, rejected = refusals.used, refusals.total
-        return {
-            "vehicle": self.job.vehicle,
-            "log": self.job.log,
-            "configuration": self.job.setup.name,
-            "begin": self._times[0] if self._times else None,
-            "end": self._times[-1] if self._times else None,
-            "duration": self._duration,
-            "windows.all": self.windows,
-            **{f"windows.{each}": self._counts[f"windows.{each}"] for each in (*Status, *State)},
-            "bearing_pressure.mean": self._bearing_sum / self._bearing_n if self._bearing_n else None,
-            **frames,
-            "samples": used,
-            **{f"rejected.{reason}": n for reason, n in sorted(rejected.items())},
-            "fault": fault,
+def _summary(table: Any, job: Job, config: Config, pipeline: Pipeline | None, fault: str | None) -> dict[str, Any]:
+    """A log's windows, a pyarrow table, in one row."""
+    columns = {name: table[name].to_pylist() for name in table.column_names if name in COUNTED}
+    counts = Counter((*columns["status"], *columns["traversability.state"]))
+    valid = [s == Status.VALID for s in columns["status"]]
+    pressures = [p for p in compress(columns.get("bearing_pressure.value", ()), valid) if p is not None]
+    times = [when.value for when in table["time"] if when.is_valid]  # the clock may be set back
+    settings = config.estimator
+    steps = (now - before for before, now in pairwise([-math.inf, *columns["t"]]))
+    frames: dict[str, int | None] = {}
+    if pipeline is None:
+        names = [name for name in table.column_names if name.startswith("rejected.")]
+        rejected = {name: sum(filter(None, table[name].to_pylist())) for name in names}
+    else:
+        heard, refusals = pipeline.admission.counts, pipeline.intake.refusals
+        rejected = {f"rejected.{reason}": n for reason, n in refusals.total.items()}
+        frames = {
+            "frames.mapped": sum(heard.received.values()),
+            "frames.unknown": heard.unknown,
+            "frames.error": heard.error_frames,
+            "frames.lost": pipeline.admission.missed,
+            "frames.other_channel": heard.elsewhere,
         }
+    return {
+        "vehicle": job.vehicle,
+        "log": job.log,
+        "configuration": job.setup.name,
+        "begin": min(times, default=None),
+        "end": max(times, default=None),
+        "duration": sum(settings.hop if 0.0 < step < 1.5 * settings.hop else settings.window for step in steps),
+        "windows.all": table.num_rows,
+        **{f"windows.{each}": counts[each] for each in (*Status, *State)},
+        "bearing_pressure.mean": sum(pressures) / len(pressures) if pressures else None,
+        **frames,
+        "samples": None if pipeline is None else refusals.used,
+        **dict(sorted(rejected.items())),
+        "fault": fault,
+    }
 
 
 @dataclass(frozen=True, slots=True)

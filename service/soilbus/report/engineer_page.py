@@ -14,7 +14,7 @@ from rich.text import Text
 from soilbus.report.dashboard import Dashboard, percent
 from soilbus.report.driver_page import LEAST_HEIGHT, LEAST_WIDTH, footer, small_page
 from soilbus.report.received_frames import ReceivedFrames
-from soilbus.report.text_charts import area, sparkline
+from soilbus.report.text_charts import sparkline
 
 COLUMN = 38
 """Columns that a block needs at least."""
@@ -224,35 +224,20 @@ BLOCKS: tuple[Callable[[Dashboard], list[Text]], ...] = (_soil, _wheels, _limits
 
 
 def _charts(dashboard: Dashboard, width: int, height: int) -> list[Text]:
-    """Histories of the last minute side by side in two columns, as tall as there is room."""
-    rows = [list(CHARTS)[i : i + 2] for i in range(0, len(CHARTS), 2)]
-    rows = rows[: max(height - 1, 0)]
-    if not rows:
-        return []
-    tall = (height - 1) // len(rows)
+    """Histories of the last minute side by side in two columns, as many as there is room for."""
     each = (width - GAP) // 2
-    lines = [Text(f"last {dashboard.span:.0f} s", style="bold")]
-    for names in rows:
-        charts = [_chart(dashboard, name, each, tall) for name in names]
-        charts += [[""] * tall] * (2 - len(charts))
-        lines += [Text(f"{left:<{each + GAP}}{right}") for left, right in zip(*charts, strict=True)]
-    return lines
+    charts = [_chart(dashboard, name, each) for name in CHARTS]
+    pairs = zip(charts[::2], charts[1::2], strict=True)
+    title = Text(f"last {dashboard.span:.0f} s", style="bold")
+    return [title, *(Text(f"{left:<{each + GAP}}{right}") for left, right in pairs)][: max(height, 0)]
 
 
-def _chart(dashboard: Dashboard, name: str, width: int, height: int) -> list[str]:
-    """Name and present value beside a sparkline, or beside a chart from zero where there are rows for one."""
+def _chart(dashboard: Dashboard, name: str, width: int) -> str:
+    """Name and present value beside a sparkline."""
     values = dashboard.history(name, width - LABEL)
     now = next((value for value in reversed(values) if value is not None), None)
     said = "-" if now is None else f"{now * IN_UNITS.get(name, 1.0):.3g}"
-    label = f"{CHARTS[name]:<13}{said:>7}  "
-    if height < 2:
-        return [label + sparkline(values)]
-    top = max((value for value in values if value is not None), default=0.0)
-    rows = area(values, height - 1, top if top > 0.0 else 1.0)
-    high = f"{top * IN_UNITS.get(name, 1.0):.3g} ┤" if top > 0.0 else "┤"
-    left = [f"{high:>{LABEL}}", *[f"{'│':>{LABEL}}"] * (height - 2)]
-    left[0] = f"{CHARTS[name]:<{LABEL - len(high)}}{high}"
-    return [*(a + b for a, b in zip(left, rows, strict=True)), ""]
+    return f"{CHARTS[name]:<12}{said:>8}  "[:LABEL] + sparkline(values)
 
 
 def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:

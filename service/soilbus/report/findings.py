@@ -9,16 +9,15 @@ before and after, and the soil of each recording before and after.  The sentence
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
-from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.where import Disagreement
-from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.posterior import Posterior
 from soilbus.offline.diagnose import Findings
 from soilbus.pipeline.outputs import known, value_std, values_std
 from soilbus.report.next_drive import plan_lines
@@ -173,7 +172,13 @@ def findings_text(findings: Findings) -> str:
     if findings.plan is not None:
         lines += ["", *plan_lines(findings.plan)]
     if diagnosis.residual_terms:
-        lines += ["", "what is left, described:", *(f"  {line}" for line in residual_lines(diagnosis.residual_terms))]
+        lines += ["", "what is left, described:"]
+        lines += [
+            f"  {_channel(terms)}: reading less model = {terms.formula} [{UNITS[terms.channel]}] "
+            f"({100 * terms.explained:.0f} % of the held-out excess)"
+            for terms in diagnosis.residual_terms
+        ]
+        lines.append(f"  {WARNING}")
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
     return text_of(lines)
 
@@ -195,16 +200,11 @@ def place_lines(findings: Findings) -> list[str]:
     has_several = len(findings.diagnosis.base.fits) > 1
     shown = [
         f"{f'{p.log}: ' if has_several and p.log else ''}{_channel(p)}, {p.region}: {size_text(p)} "
-        f"(chance {chance_text(p.significance)})"
+        f"(chance {f'{p.significance:.0e}' if p.significance > 0.0 else '< 1e-300'})"
         for p in where[:MAX_PLACES]
     ]
     left = len(where) - len(shown)
     return [*shown, f"and {left} more"] if left else shown
-
-
-def chance_text(chance: float) -> str:
-    """A probability that may be too small for a float."""
-    return f"{chance:.0e}" if chance > 0.0 else "< 1e-300"
 
 
 def _channel(place: Disagreement | ResidualTerms) -> str:
@@ -261,38 +261,20 @@ def configured_lines(diagnosis: Diagnosis) -> Iterator[str]:
             yield f"in the configuration, {effect.name}: {'; '.join(found)}"
 
 
-def residual_lines(descriptions: Sequence[ResidualTerms]) -> list[str]:
-    """The residual terms, and a warning of what they are worth."""
-    lines = [
-        f"{_channel(c)}: reading less model = {c.formula} [{UNITS[c.channel]}] "
-        f"({100 * c.explained:.0f} % of the held-out excess)"
-        for c in descriptions
-    ]
-    return [*lines, WARNING]
-
-
-def _soil_lines(findings: Findings) -> list[str]:
-    lines: list[str] = []
-    several = len(findings.recordings.first) > 1
-    for name, before, after in findings.soils():
-        head = (f"soil of {name}" if several else "soil", "before", "after")
-        lines += table(head, soil_rows(before, after, findings.config)).splitlines()
-    return lines
-
-
-def soil_rows(before: Posterior, after: Posterior, config: Config) -> list[tuple[str, str, str]]:
-    """Name and unit, value and std before and after, of the bearing pressure and each soil parameter."""
-    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
-    both = [{"bearing pressure, kPa": _scaled(p.bearing_pressure(z_ref, b_ref), 1e3)} for p in (before, after)]
-    for row, posterior in zip(both, (before, after), strict=True):
-        for name, estimate in posterior.parameters().items():
-            unit, size = SHOWN[name]
-            row[f"{name}, {unit}".rstrip(", ")] = _scaled(estimate, size)
-    return [(name, both[0][name], both[1][name]) for name in both[0]]
-
-
-def _scaled(estimate: Estimate, unit: float) -> str:
-    return value_text(estimate.value / unit, estimate.std / unit)
+def _soil_lines(findings: Findings) -> Iterator[str]:
+    """Bearing pressure and soil parameters of each recording, value and std before and after."""
+    settings, several = findings.config.estimator, len(findings.recordings.first) > 1
+    for log, *both in findings.soils():
+        rows: dict[str, list[str]] = {}
+        for posterior in both:
+            found = {"bearing pressure, kPa": (posterior.bearing_pressure(settings.z_ref, settings.b_ref), 1e3)}
+            for name, estimate in posterior.parameters().items():
+                unit, size = SHOWN[name]
+                found[f"{name}, {unit}".rstrip(", ")] = estimate, size
+            for name, (of, size) in found.items():
+                rows.setdefault(name, []).append(value_text(of.value / size, of.std / size))
+        head = (f"soil of {log}" if several else "soil", "before", "after")
+        yield from table(head, [(name, *texts) for name, texts in rows.items()]).splitlines()
 
 
 def admission_line(findings: Findings) -> str:
