@@ -156,17 +156,10 @@ class Posterior:
         return self._estimate(shear_strength(self.soil, pressure))
 
     def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
-        """Return the posterior with a covariance of the logarithms added, as by considered parameters.
+        """Return the posterior with a covariance (6, 6) of the logarithms added, as by considered parameters.
 
-        Parameters
-        ----------
-        more : (6, 6)
-            Added.  Principal variances of the sum, in units of the prior's, are clipped to 1, or to the greatest
-            that the posterior has itself.
-        prior
-            Of the soil.
-        shift : (6,), optional
-            Of the logarithms, from this soil to the mean over the considered parameters.
+        Principal variances of the sum, in units of the prior's, are clipped to 1, or to the greatest that the posterior
+        has itself. shift (6,): of the logarithms, from this soil to the mean over the considered parameters.
         """
         free = prior.free
         if not len(free):
