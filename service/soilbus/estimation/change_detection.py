@@ -97,19 +97,10 @@ def log_likelihood_ratio(misfit: Array, count: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def alarm_threshold(probability: float, instants: int, residuals: int) -> float:
-    """Return the threshold that the largest GLR of noise passes with a given probability.
+    """Return the threshold, a log likelihood ratio, that the largest GLR of noise passes with a probability.
 
-    Parameters
-    ----------
-    probability : float
-        Of a false alarm, at most 0.1: the formula is of the tail.
-    instants, residuals : int
-        Instants at which a change may begin, and residuals of each.
-
-    Returns
-    -------
-    float
-        Log likelihood ratio, between 0.5 and 700.
+    The probability is 0.1 at most, as the formula is of the tail; `residuals` has each of the `instants` at which a
+    change may begin.
 
     Examples
     --------

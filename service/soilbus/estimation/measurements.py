@@ -85,19 +85,9 @@ def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
 class Measurements:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
-    Each has its variance and a mask of what is known; all are zero where it is not.
-    `standstill` and `turning` count instants left out; reversing counts as driving forward.
-
-    Parameters
-    ----------
-    window : Window
-        Bin means and variances.
-    rig : Rig
-        Wheels, geometry and sensor noise.
-    min_speed : float
-        Ground speed [m/s] up to which instants are left out.
-    max_turn : float
-        Relative difference of an axle's rim speeds above which instants are left out.
+    Each has its variance and a mask of what is known; all are zero where it is not.  `standstill` and `turning` count
+    instants left out: up to min_speed [m/s], and with rim speeds of an axle that differ by more than max_turn of their
+    mean; reversing counts as driving forward.
     """
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:

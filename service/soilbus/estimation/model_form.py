@@ -50,10 +50,7 @@ _SOIL = len(PARAMETERS)
 def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
     """Return the mean (4,) and covariance (4, 4) of the form parameters before any data.
 
-    Parameters
-    ----------
-    farthest
-        How far each of FORM may be from the configured form, whose value is 0; none is negative.
+    farthest: how far each of FORM may be from the configured form, whose value is 0; none is negative.
     """
     reach = np.asarray(farthest)
     return SIDE * reach / 2.0, np.diag(OF_SQUARE * reach**2)

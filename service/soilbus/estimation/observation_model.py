@@ -66,24 +66,10 @@ from soilbus.terra.wheel import (
 class ObservationModel(Measurements):
     """One window's measurements and the wheel-soil model; `linearise` gives residuals and derivatives at any soil.
 
-    Parameters
-    ----------
-    window : Window
-        Bin means and variances.
-    rig : Rig
-        Wheels, geometry and sensor noise.
-    model : WheelModel
-        The wheel-soil model.
-    min_speed : float
-        Ground speed [m/s] up to which instants are left out.
-    max_turn : float
-        Relative difference of an axle's rim speeds above which instants are left out; as in `config.model.Estimator`.
-
-    Notes
-    -----
-    The nuisance parameters, `gains` (G,) throughout, are the sensors' relative gain errors
-    in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) are the lowest and the highest
-    values, infinite where there is none.  `work` counts evaluations.
+    min_speed: ground speed [m/s] up to which instants are left out; max_turn: relative difference of an axle's rim
+    speeds above which they are, as in `config.model.Estimator`.  The nuisance parameters, `gains` (G,) throughout, are
+    the sensors' relative gain errors in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) are
+    the lowest and the highest values, infinite where there is none. `work` counts evaluations.
     """
 
     def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = 0.15) -> None:
@@ -101,23 +87,10 @@ class ObservationModel(Measurements):
         return stamped
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
-        """Residuals, their derivatives and their inverse covariance at one point.
+        """Residuals, their derivatives and their inverse covariance at one point, with the latents eliminated.
 
-        Parameters
-        ----------
-        soil : Soil
-            Six parameters in SI.
-        gains : Array
-            Sensor gains, then effect parameters (G,).
-        latents : Latents
-            Of all N instants.
-        by_sensors : bool
-            Whether derivatives by the sensor gains are computed too.
-
-        Returns
-        -------
-        Linearisation
-            With the latents eliminated: a step of soil and gains moves them as `updated` says.
+        gains (G,): sensor gains, then effect parameters; by_sensors: whether derivatives by the sensor gains are
+        computed too.  A step of soil and gains moves the latents as `updated` says.
         """
         layout = self.layout if by_sensors else Layout.of(self.n_wheels, 0)
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages

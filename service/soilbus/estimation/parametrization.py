@@ -32,16 +32,9 @@ _K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi"
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The coordinates (F,) of the free parameters.
+    """The coordinates (F,) of the free parameters, with tyres of a mean width [m].
 
-    Parameters
-    ----------
-    prior
-        Decides which parameters are free, the values of the others, and the bounds.
-    width
-        Mean tyre width [m].
-    options
-        Typical depth, bounds, limits of a step.
+    The prior decides which parameters are free, the values of the others, and the bounds.
     """
 
     prior: SoilPrior

@@ -156,27 +156,18 @@ class Posterior:
         return self._estimate(shear_strength(self.soil, pressure))
 
     def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
-        """Return the posterior with a covariance of the logarithms added, as by considered parameters.
+        """Return the posterior with a covariance (6, 6) of the logarithms added, as by considered parameters.
 
-        Parameters
-        ----------
-        more : (6, 6)
-            Added.  Principal variances of the sum, in units of the prior's, are clipped to 1, or to the greatest
-            that the posterior has itself.
-        prior
-            Of the soil.
-        shift : (6,), optional
-            Of the logarithms, from this soil to the mean over the considered parameters.
+        Principal variances of the sum, in units of the prior's, are clipped to 1.  shift (6,): of the logarithms, from
+        this soil to the mean over the considered parameters.
         """
         free = prior.free
         if not len(free):
             return self
         unit, at = np.outer(prior.log_std[free], prior.log_std[free]), np.ix_(free, free)
-        own = self.log_covariance[at] / unit
-        variance, axes = np.linalg.eigh(own + more[at] / unit)
-        most = max(1.0, float(np.linalg.eigvalsh(own)[-1]))
+        variance, axes = np.linalg.eigh((self.log_covariance + more)[at] / unit)
         covariance = np.zeros_like(self.log_covariance)
-        covariance[at] = (axes * np.clip(variance, 0.0, most)) @ axes.T * unit
+        covariance[at] = (axes * np.clip(variance, 0.0, 1.0)) @ axes.T * unit
         if shift is None:
             return Posterior(self.soil, covariance)
         logs = np.zeros(len(self.soil))

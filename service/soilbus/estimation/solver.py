@@ -107,23 +107,10 @@ class WindowModel(QuadraticModel):
 class Objective:
     """-2 log posterior of a window: its residuals and those of its prior, with derivatives.
 
-    Parameters
-    ----------
-    problem
-        The window's observation model: N instants, W wheels, G gains.
-    prior
-        Prior of the soil, which sets the free coordinates (F).
-    joint_prior
-        Prior of soil and gains for this window.
-    as_measured
-        Whether the latents are held as measured and the sensors' gains too: far from the optimum they would absorb
-        the residuals of a wrong soil.  Gains and effect parameters that are not held and have a variance are
-        active (A).
-
-    Raises
-    ------
-    ValueError
-        Where `joint_prior` has no proper covariance.
+    The prior of the soil sets the free coordinates (F), joint_prior is of soil and gains for this window; ValueError
+    where it has no proper covariance. as_measured: the latents are held as measured, and the sensors' gains too; far
+    from the optimum they would absorb the residuals of a wrong soil.  Gains and effect parameters that are not held and
+    have a variance are active (A).
     """
 
     def __init__(
@@ -159,16 +146,9 @@ class Objective:
     # Iterates
 
     def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
-        """Return an iterate with the latents as measured.
+        """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's, with the latents as measured.
 
-        Parameters
-        ----------
-        soil : (6,)
-            In SI.
-        guess : (N, W), optional
-            Entry angles [rad] to solve them from.
-        gains : (G,), optional
-            Those of the joint prior if not given.
+        guess (N, W): entry angles [rad] to solve them from.
         """
         gains = self.joint_prior.gains if gains is None else gains
         return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains))

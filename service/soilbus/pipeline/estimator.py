@@ -176,7 +176,8 @@ class WindowEstimator:
         if fit is not None and status is not Status.INVALID:
             own = posterior = fit.mode.posterior
             if fit.form is not None:
-                posterior = own.with_added_covariance(fit.form.log_covariance, self.prior, fit.form.log_shift)
+                prior = self._tracker.soil_prior
+                posterior = own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
         basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
