@@ -271,7 +271,7 @@ def left_by(
     left = _time_to_weaken(x, capacity, reserve, float(rows[:, 3].max()), options)
     weakens = left < options.warning_time
     cause = "the ground is to give less than is asked"
-    now = _seen(now, 1, lasts[1] if weakens else 0.0, left, cause, options.lasting)
+    now = _seen(now, 1, lasts[1] if weakens else 0.0, left, cause, options.lasting_fall)
     return now._replace(time_left=math.inf if now.time_left is None else now.time_left)
 
 
