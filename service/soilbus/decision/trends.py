@@ -69,11 +69,10 @@ class LocalTrend(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Regression line with exponential forgetting: value now, slope [1/s], spread of the times [s^2]."""
+    """Regression line with exponential forgetting: value now, and slope [1/s]."""
 
     value: float
     slope: float
-    spread: float
 
     @classmethod
     def through(cls, x: Array, y: Array, memory: float) -> Line:
@@ -82,11 +81,11 @@ class Line(NamedTuple):
         weight, y = np.exp(x / memory) * known, np.where(known, y, 0.0)
         total = float(weight.sum())
         if total <= 0.0:
-            return cls(math.nan, 0.0, 0.0)
+            return cls(math.nan, 0.0)
         t, mean = float(weight @ x) / total, float(weight @ y) / total
         spread = float(weight @ (x - t) ** 2) / total
         slope = float((weight * (x - t)) @ y) / total / spread if spread > 1e-9 else 0.0
-        return cls(mean - slope * t, slope, spread)
+        return cls(mean - slope * t, slope)
 
 
 class Extrapolation(NamedTuple):
@@ -102,7 +101,7 @@ class Extrapolation(NamedTuple):
         Sum of squares of what came less that, and their number, both with exponential forgetting.
     """
 
-    line: Line = Line(math.nan, 0.0, 0.0)
+    line: Line = Line(math.nan, 0.0)
     foreseen: tuple[tuple[float, float], ...] = ()
     error: float = 0.0
     checks: float = 0.0

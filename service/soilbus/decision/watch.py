@@ -6,12 +6,10 @@
     stops          P(q + h dq/dt > -ln(1 - s_max)) or P(V + h dV/dt < 0) > p while thrust holds, q = -ln(1 - s)
     weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q, beyond what a wrong curve explains
     outgrows       P(Q + h dQ/dt > C) > p, by the errors of earlier such extrapolations and the curve's width
-    creeps         P(s + h ds/dt > s_max) > p, by the same errors of slip
-    takes all      Q > 0.9 max P_hat
-    slips          s > 0.7 s_max
+    takes all      Q > 0.9 max P_hat, or s > s_max
 
 P: pull given, P_hat: pull over slip of the last window (Kalman filter and regressions with exponential forgetting).
-The first three and `creeps` need no soil: a local linear trend follows q, V and sinkage, and slip that shakes widens
+The first three need no soil: a local linear trend follows q, V and sinkage, and slip that shakes widens
 it.  The others need the curve and some seconds of moments.  The moments are kept and seen along the newest curve: so a
 new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.
 
@@ -215,12 +213,10 @@ class Margin(NamedTuple):
         (N, 4): time [s], common slip, pull given [N], demand of draft and slope [N] of the last moments.
     since
         [s], of the first moment without a gap.
-    demand, slip
-        Lines through the demand [N] and the common slip.
+    demand
+        Line through the demand [N].
     lasts
-        [s], for how long slip has led beyond its limit, the demand has outgrown the ground, and the ground weakened.
-    share
-        Demand as a share of the capacity.
+        [s], for how long the demand has outgrown the ground, and the ground weakened.
     cause
         What is seen now; empty for nothing.
     time_left
@@ -230,17 +226,14 @@ class Margin(NamedTuple):
     rows: Array = np.empty((0, 4))
     since: float = math.inf
     demand: Extrapolation = Extrapolation()
-    slip: Extrapolation = Extrapolation()
-    lasts: tuple[float, ...] = (0.0, 0.0, 0.0)
-    share: float = 0.0
+    lasts: tuple[float, ...] = (0.0, 0.0)
     cause: str = ""
     time_left: float | None = None
 
 
 def left_by(
-    before: Margin, row: tuple[float, float, float, float], curve: OverSlip | None, max_slip: float,
-    options: WatchOptions = WATCH,
-) -> Margin:  # fmt: skip
+    before: Margin, row: tuple[float, float, float, float], curve: OverSlip | None, options: WatchOptions = WATCH
+) -> Margin:
     """Return the margin after one more row of `Margin.rows`, by a curve of pull over slip."""
     t, slip, *_ = row
     last = float(before.rows[-1, 0]) if len(before.rows) else -math.inf
@@ -249,36 +242,20 @@ def left_by(
     step = t - last if len(before.rows) else 0.0
     rows = np.vstack([before.rows[before.rows[:, 0] > t - options.memory], row])
     x, age = rows[:, 0] - t, t - before.since
-    demand, creep = (
-        was.after(t, step, Line.through(x, rows[:, i], options.slow_memory), age, options)
-        for was, i in ((before.demand, 3), (before.slip, 1))
-    )
-    now = Margin(rows, before.since, demand, creep)
-    if age < options.settling_time:
-        return now
-    works = age >= options.check_least and slip > options.least_slip
-    leads = works and creep.probability_above(max_slip, 0.0, options) > options.outgrows
-    left = creep.time_to(max_slip) if leads else math.inf
-    lasts = [so_far + step for so_far in before.lasts]
-    now = _seen(now, 0, lasts[0] if leads else 0.0, left, "slip is to pass its limit", options.lasting)
-    if curve is None:
+    demand = before.demand.after(t, step, Line.through(x, rows[:, 3], options.slow_memory), age, options)
+    now = Margin(rows, before.since, demand)
+    if curve is None or age < options.settling_time:
         return now
     slips, pulls, ahead = _known_pulls(curve)
     most, std = float(ahead[0]), _std_of_most(curve)
     if slip >= slips[-1]:
-        return now._replace(share=1.0, cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
+        return now._replace(cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
     if most <= 0.0:
         return now
     compares = std < options.unknown * most
     within = rows[:, 1]
-    lately = x > -options.lasting - 0.5 * step
-    level = ""
-    if compares and float(rows[lately, 3].min()) > options.near * most:
-        level = "draft and slope take nearly all that the ground gives"
-    elif compares and float(within[lately].min()) > options.slips * max_slip:
-        level = f"wheels slip by {100.0 * slip:.0f} %"
-    if level:
-        now = now._replace(share=1.0, cause=level)
+    if compares and float(rows[x > -options.lasting - 0.5 * step, 3].min()) > options.near * most:
+        now = now._replace(cause="draft and slope take nearly all that the ground gives")
     reserve = ahead[np.searchsorted(slips, within, "right")] - np.interp(within, slips, pulls)
     capacity = np.where(within >= slips[0], rows[:, 2] + reserve, np.nan)
     lately = x > -options.slow_memory
@@ -286,17 +263,16 @@ def left_by(
         return now
     limit = min(Line.through(x, capacity, options.slow_memory).value, most)
     width = min(std, options.widest * most)
-    works = works and compares and demand.line.value > options.least_share * limit
+    works = compares and age >= options.memory and demand.line.value > options.least_share * limit
     leads = works and demand.probability_above(limit - width, width, options) > options.outgrows
     left = demand.time_to(limit) if leads else math.inf
-    outgrown = "draft and slope are to outgrow the ground"
-    now = _seen(now, 1, lasts[1] if leads else 0.0, left, outgrown, options.lasting)
+    lasts = [so_far + step for so_far in before.lasts]
+    now = _seen(now, 0, lasts[0] if leads else 0.0, left, "draft and slope are to outgrow the ground", options.lasting)
     left = _time_to_weaken(x, capacity, reserve, float(rows[:, 3].max()), options)
     weakens = left < options.warning_time
     cause = "the ground is to give less than is asked"
-    now = _seen(now, 2, lasts[2] if weakens else 0.0, left, cause, options.lasting_fall)
-    share = max(now.share, demand.line.value / limit) if limit > 0.0 else 1.0
-    return now._replace(share=share, time_left=math.inf if now.time_left is None else now.time_left)
+    now = _seen(now, 1, lasts[1] if weakens else 0.0, left, cause, options.lasting_fall)
+    return now._replace(time_left=math.inf if now.time_left is None else now.time_left)
 
 
 def _seen(now: Margin, place: int, lasts: float, left: float, cause: str, least: float) -> Margin:
@@ -366,8 +342,9 @@ class Watch(NamedTuple):
         Slip, and pull [N], low-pass filtered with the time constant `spin_time`; nan where not known.
     engaged
         Which wheels drive.
-    reckoned
-        [m/s], ground speed from acceleration and wheels; nan where the acceleration is not measured.
+    reckoned, measured
+        [m/s], ground speed, from acceleration and wheels where it is not measured, nan where neither is; when it was
+        measured last.
     stall, margin
         What slip and speed say, and what the curve leaves.
     caused
@@ -390,6 +367,7 @@ class Watch(NamedTuple):
     pull: float = math.nan
     engaged: tuple[bool, ...] = ()
     reckoned: float = math.nan
+    measured: float = -math.inf
     stall: Stall = Stall()
     margin: Margin = Margin()
     caused: float = -math.inf
@@ -417,27 +395,30 @@ def watched(
     options
         Tuning values.
     """
-    limits, stall, reckoned = config.traversability, before.stall, math.nan
+    limits, stall, reckoned, measured = config.traversability, before.stall, math.nan, before.measured
     if (sample := moment.last) is not None:
         reckoned = _reckoned(before, moment, sample, options)
         if blind := math.isnan(sample.ground):
             sample = sample._replace(ground=reckoned, ground_var=sample.rim_var)
+        elif not sample.t - measured <= LONGEST_GAP:  # what was reckoned so long is no trend
+            stall = Stall()
         stall = stalling(stall, sample, config.estimator.min_speed, config.warning, limits, options)
         if blind:  # what is reckoned is no all-clear
             stall = stall._replace(heard=before.stall.heard)
+        else:
+            measured = sample.t
     now, margin = _moved(before, moment, config), before.margin
-    now = now._replace(stall=stall, engaged=moment.engaged, reckoned=reckoned)
+    now = now._replace(stall=stall, engaged=moment.engaged, reckoned=reckoned, measured=measured)
     if moment.engaged != before.engaged:  # another drive has another curve
         margin = Margin()
     if math.isfinite(moment.common + moment.given):
         asked = moment.given - moment.inertia + moment.mass * stall.slope
         if not len(margin.rows) or moment.t != margin.rows[-1, 0]:
-            margin = left_by(margin, (moment.t, moment.common, moment.given, asked), curve, limits.max_slip, options)
+            margin = left_by(margin, (moment.t, moment.common, moment.given, asked), curve, options)
     elif len(margin.rows) and not 0.0 <= moment.t - float(margin.rows[-1, 0]) <= LONGEST_GAP:
         margin = Margin()
     fresh = before.caused if 0.0 <= moment.t - before.caused < options.hold else -math.inf
-    stays = not math.isinf(fresh) and margin.share > options.kept_share
-    return seen_at(now._replace(margin=margin, caused=moment.t if margin.cause or stays else fresh), moment.t, config)
+    return seen_at(now._replace(margin=margin, caused=moment.t if margin.cause else fresh), moment.t, config)
 
 
 def seen_at(watch: Watch, now: float, config: Config, options: WatchOptions = WATCH) -> Watch:
@@ -510,7 +491,9 @@ def _moved(before: Watch, moment: Moment, config: Config) -> Watch:
 
 
 def _reckoned(before: Watch, moment: Moment, sample: Sample, options: WatchOptions) -> float:
-    """Return the ground speed [m/s] from the acceleration since before, drawn to the wheels' speed; nan without one."""
+    """Return the ground speed [m/s], else the last one and acceleration since, drawn to the wheels; nan without one."""
+    if math.isfinite(sample.ground):
+        return sample.ground
     step = moment.t - before.t
     if not (math.isfinite(moment.pull) and math.isnan(sample.felt) and math.isfinite(sample.rim)):
         return math.nan
