@@ -74,6 +74,6 @@ def test_the_noise_is_that_of_the_recording_whatever_the_configuration_says(reco
     for noise in ([], HALF, TWICE):
         records = [record_with((), noise)]
         for _ in range(2):
-            records = with_noise_floor(records, fit_model(records, PRIOR, ()))
+            records = with_noise_floor(records, PRIOR, fit_model(records, PRIOR, ()))
         gap = gap_of(fit_model(records, PRIOR, ()))
         assert abs(gap.value - 1.0) < 4.0 * math.sqrt(2.0 / gap.rows)

@@ -127,7 +127,7 @@ def diagnose(
     base = full.fit(records[0].training.effects)
     for _ in range(options.noise_rounds if all(record.source is not None for record in records) else 0):
         if base is not None:
-            records = with_noise_floor(records, base)
+            records = with_noise_floor(records, prior, base)
             full = FitCache(records, prior, options)
             base = full.fit(base.effects, [base.as_starts()])
     if base is not None and any(record.training.computes_loads for record in records):
@@ -159,7 +159,7 @@ def diagnose(
         additions, present = [], base
     if additions and all(record.source is not None for record in records):  # the noise without what they explain
         progress("finding the noise floor")
-        records = with_noise_floor(records, present)
+        records = with_noise_floor(records, prior, present)
         full = FitCache(records, prior, options)
         again = full.fit(base.effects, [base.as_starts()]), full.fit(present.effects, [present.as_starts()])
         if again[0] is not None and again[1] is not None:

@@ -2,7 +2,8 @@
 
     sd^2 of a sensor = [noise]^2 * f,    f = sum of (v_i+k - v_i)^2 / sum of the same of expected squares
 
-v are the sensor's corrections (`variance_components`) at instants that are one sample of it apart.  What a model
+v are the sensor's corrections (`variance_components`) in bins that are one sample of it apart, not in the means over
+instants that models are fitted to.  What a model
 misses moves slowly beside the sampling, and differences cancel it (von Neumann 1941, Ann. Math. Stat. 12:367).  So f
 is that of the noise alone, whatever is missing.
 """
@@ -15,37 +16,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.fitted_model import FittedModel, check
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.variance_components import KINDS, corrections
 
 
-def with_noise_floor(records: Sequence[Record], fitted: FittedModel) -> list[Record]:
+def with_noise_floor(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> list[Record]:
     """Return the records with the noise that differences of a fitted model's corrections show."""
-    found = noise_factors(records, fitted)
+    found = noise_factors(records, prior, fitted)
     return [
         record.with_noise({kind: record.noise.get(kind, 1.0) * factor for kind, factor in found.items()})
         for record in records
     ]
 
 
-def noise_factors(records: Sequence[Record], fitted: FittedModel) -> dict[str, float]:
+def noise_factors(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> dict[str, float]:
     """Return the factor on each kind of sensor's variance that differences of its corrections show."""
     squares: dict[str, Array] = {}
-    for record, fit, check in zip(records, fitted.fits, fitted.checks, strict=True):
-        training = record.training.with_effects(fitted.effects, fitted.free)
-        parts = (training, fit.optimum.at, fit.optimum.gains), (check.problem, check.at, fit.mode.gains)
-        for problem, at, gains in parts:
-            values, of_squares, columns = corrections(problem, at, gains)
-            for kind, own in columns.items():
-                value, expected = values[:, own], of_squares[:, own]
-                first, next_ = _neighbours(problem, KINDS[kind])
-                known = np.minimum(expected[first], expected[next_]) > 0.0
-                change = (value[next_] - value[first])[known]
-                of_noise = (expected[first] + expected[next_])[known]
-                found = np.array([float(change @ change), float(of_noise.sum()), len(first)])
-                squares[kind] = squares.get(kind, np.zeros(3)) + found
+    for record, fit in zip(records, fitted.fits, strict=True):
+        assert record.bins is not None
+        problem = record.bins.with_effects(fitted.effects, fitted.free)
+        at = check(problem, prior, fit, options=record.options).at
+        values, of_squares, columns = corrections(problem, at, fit.mode.gains)
+        for kind, own in columns.items():
+            value, expected = values[:, own], of_squares[:, own]
+            first, next_ = _neighbours(problem, KINDS[kind])
+            known = np.minimum(expected[first], expected[next_]) > 0.0
+            change = (value[next_] - value[first])[known]
+            of_noise = (expected[first] + expected[next_])[known]
+            found = np.array([float(change @ change), float(of_noise.sum()), len(first)])
+            squares[kind] = squares.get(kind, np.zeros(3)) + found
     least = records[0].training.options.variance.least_share
     return {
         kind: float(found / noise)

@@ -48,6 +48,8 @@ class Record:
         recording.
     whole
         Observation model of all instants; None of a table.
+    bins
+        The same of all bins, of which instants are means.
     options
         Of its diagnosis.
     source
@@ -61,6 +63,7 @@ class Record:
     held_out: ObservationModelWithEffects
     joint_prior: Gaussian | None = None
     whole: ObservationModelWithEffects | None = None
+    bins: ObservationModelWithEffects | None = None
     options: DiagnosisOptions = DEFAULT
     source: tuple[Window, Rig, WheelModel, float, float] | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
@@ -101,7 +104,7 @@ class Record:
         parts = self.training, self.held_out
         least = self.options.min_sample
         training, held_out = (part.part(slice(None, None, min(every, part.n // least + 1))) for part in parts)
-        return replace(self, training=training, held_out=held_out, whole=None)
+        return replace(self, training=training, held_out=held_out, whole=None, bins=None)
 
 
 def diagnosed(rig: Rig) -> Rig:
@@ -141,9 +144,10 @@ def record_of(
         Where the recording has not enough usable instants.
     """
     end = float(window.t[-1]) if len(window.t) else 0.0
-    window = averaged(window, end, instant_of(rig, rig.options.tracker.instant))
-    problem = ObservationModelWithEffects(window, diagnosed(rig), model, min_speed, max_turn)
-    problem = problem.with_own_stamps().on_curves()
+    bins, problem = (
+        ObservationModelWithEffects(part, diagnosed(rig), model, min_speed, max_turn).with_own_stamps().on_curves()
+        for part in (window, averaged(window, end, instant_of(rig, options.instant)))
+    )
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
@@ -153,7 +157,7 @@ def record_of(
     if not (training.n_rows and held_out.n_rows):
         raise TooLittle(f"{name}: neither a torque nor a draft is known with its load, slip and slope at once")
     source = window, rig, model, min_speed, max_turn
-    return Record(name, training, held_out, whole=problem, options=options, source=source)
+    return Record(name, training, held_out, whole=problem, bins=bins, options=options, source=source)
 
 
 def record_of_rows(
