@@ -23,38 +23,15 @@ def wheel(soil: Soil, load: float, slip: float, radius: float, width: float) -> 
     return np.append(wheel_forces(state_on(soil, angle, slip, radius, width), MODEL), angle)
 
 
-NO_LIMITS = (np.inf, np.inf)
-MOST_SKID = -0.5
-
-
-def wheel_at_most(limit: float, soil: Soil, load: float, slip: float, *size: float) -> np.ndarray:
-    """The wheel at this slip, or at the one at which its motor gives its most; in a trial load perhaps MOST_SKID."""
-    found = wheel(soil, load, slip, *size)
-    if found[2] <= limit:
-        return found
-
-    def beyond(s: float) -> float:
-        return float(wheel(soil, load, s, *size)[2]) - limit
-
-    return wheel(soil, load, brentq(beyond, MOST_SKID, slip) if beyond(MOST_SKID) < 0.0 else MOST_SKID, *size)
-
-
-def axles(soil: Soil, slip: float, draft: float, sine: float, limits: tuple[float, float] = NO_LIMITS) -> np.ndarray:
-    """(4, axle) forces and entry angle of one front and one rear wheel, with the most that their motors give."""
+def axles(soil: Soil, slip: float, draft: float, sine: float) -> np.ndarray:
+    """(4, axle) forces and entry angle of one front and one rear wheel."""
     across = WEIGHT * np.sqrt(1.0 - sine**2)
     front = (across * 0.95 - WEIGHT * sine * 0.75 - draft * 0.45) / 1.95
     rear = across - front
-    sizes = (limits[0], soil, front / 2, slip, 0.50, 0.26), (limits[1], soil, rear / 2, slip, 0.62, 0.38)
-    return np.stack([wheel_at_most(*size) for size in sizes], axis=1)
+    return np.stack([wheel(soil, front / 2, slip, 0.50, 0.26), wheel(soil, rear / 2, slip, 0.62, 0.38)], axis=1)
 
 
-def brute(
-    soil: Soil,
-    slip: float,
-    draft: float | None = None,
-    sine: float | None = 0.0,
-    limits: tuple[float, float] = NO_LIMITS,
-) -> tuple[float, np.ndarray]:
+def brute(soil: Soil, slip: float, draft: float | None = None, sine: float | None = 0.0) -> tuple[float, np.ndarray]:
     """Pull at which draft, slope and wheels balance, and forces of the axles; the duty that is None takes the rest."""
 
     def split(pull: float) -> tuple[float, float]:
@@ -63,11 +40,9 @@ def brute(
         assert sine is not None
         return pull - WEIGHT * sine, sine
 
-    between = ((draft or 0.0) - 0.75 * WEIGHT, 0.6 * WEIGHT)
-    if limits != NO_LIMITS:
-        between = (brute(soil, 0.02, draft, sine)[0], brute(soil, slip, draft, sine)[0] + 1.0)
-    pull = brentq(lambda p: 2.0 * axles(soil, slip, *split(p), limits)[1].sum() - p, *between, xtol=1e-3)
-    return pull, axles(soil, slip, *split(pull), limits)
+    least = (draft or 0.0) - 0.75 * WEIGHT
+    pull = brentq(lambda p: 2.0 * axles(soil, slip, *split(p))[1].sum() - p, least, 0.6 * WEIGHT, xtol=1e-3)
+    return pull, axles(soil, slip, *split(pull))
 
 
 def brute_with_rolling(soil: Soil, slip: float, rolling: str) -> tuple[float, dict[str, np.ndarray]]:

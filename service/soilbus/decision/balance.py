@@ -3,7 +3,6 @@
     pull balance      sum(P_w(s, N_w)) = draft + weight * sine        P_w: drawbar pull of a wheel [N], s: slip
     load transfer     N_w = level_w * cosine + tilt_w * sine + lever_w * draft
     largest pull      max over s of the pull, subject to T_w <= T_max, entry angle <= its limit, s <= s_max
-    own motors        a wheel at its T_max keeps that torque, T(s_w, N_w) = T_max; s is the slip of the others
 
 A duty is a draft, a slope, or both.  The wheels' table (`wheels.wheel_table`) holds the steady states on the level at a
 few slips, with their derivatives by load and slip.  Other duties follow by Newton steps on the pull; the slips between
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.decision.sigma_points import SigmaPoints
 from soilbus.decision.uncertain_model import ModelOfRows
-from soilbus.decision.wheels import DRAWBAR, MAX_SINE, TORQUE, Axles, WheelTable
+from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
 __all__ = [
@@ -34,7 +33,6 @@ __all__ = [
     "Duty",
     "Largest",
     "Limits",
-    "at_limits",
     "axle_sum",
     "balance",
     "climbing",
@@ -238,64 +236,6 @@ def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list
     changes, balanced = _change_under(table, Duty(np.array(drafts)[:, None, None], None))
     columns = level.columns + _interpolated(changes, of_changes)
     return [Balance(slip, _between(known, cell), of) for known, of in zip(balanced, columns, strict=True)]
-
-
-def at_limits(balance: Balance, limits: Limits, table: WheelTable, duty: Duty) -> Balance:
-    """Return the balance in which a wheel at the limit of its own motor keeps its torque while the others slip more.
-
-    Parameters
-    ----------
-    balance
-        Steady states of D soils at one slip of all driven wheels.
-    limits
-        Of torque; those of motors that several kinds of wheels share are not applied.
-    table, duty
-        Wheels and duty of the balance.
-
-    Notes
-    -----
-    At the same torque the pull changes with the load by P_N - P_s T_N / T_s: to first order from where the limit is
-    met.  The kind that is the last to meet its limit goes on beyond it.
-    """
-    axles, kinds = table.axles, len(table.axles.count)
-    limit = np.where(axles.driven, limits.torque[:kinds, None], np.inf)
-    if kinds < 2 or not (balance.torque > limit).any():
-        return balance
-    by_load = np.stack([_interpolated(of, _refinement(tuple(table.slip.tolist()))[-1]) for of in table.by_load[:, 0]])
-    by_pull = axles.lever if duty.draft is None else axles.tilt / axles.weight
-    columns = balance.columns.copy()
-    pull, values = columns[:, 0], columns[:, 1:].reshape(len(columns), 3, kinds, -1)
-    by_load = np.broadcast_to(by_load, values.shape).copy()
-    free = np.broadcast_to(axles.driven[:, 0], (len(columns), kinds)).copy()
-    for _ in range(kinds - 1):
-        over = (values[:, TORQUE] > limit) & free[..., None] & balance.known[:, None]
-        begins = np.where(over.any(axis=-1), over.argmax(axis=-1), over.shape[-1])
-        kind, first = begins.argmin(axis=1), begins.min(axis=1)
-        row = np.flatnonzero((first > 0) & (first < over.shape[-1]) & (free.sum(axis=1) > 1))
-        if not len(row):
-            break
-        kind, first, each = kind[row], first[row], np.arange(len(row))
-        load = axles.loads(*duty.split(pull[row], axles.weight))[each, kind]
-        of_kind, slopes = values[row, :, kind], by_load[row, :, kind]
-        before, step = of_kind[each, :, first - 1], of_kind[each, :, first] - of_kind[each, :, first - 1]
-        load_step = load[each, first] - load[each, first - 1]
-        share = (limit[kind, 0] - before[:, TORQUE]) / step[:, TORQUE]
-        slope = slopes[each, :, first]
-        by_slip = step - slope * load_step[:, None]
-        held = slope - by_slip / by_slip[:, TORQUE, None] * slope[:, TORQUE, None]
-        change = load - (load[each, first - 1] + share * load_step)[:, None]
-        met = before + share[:, None] * step
-        beyond = np.arange(over.shape[-1]) >= first[:, None]
-        to_held = np.where(beyond[:, None], met[..., None] + held[..., None] * change[:, None] - of_kind, 0.0)
-        values[row, :, kind] += to_held
-        by_load[row, :, kind] = np.where(beyond[:, None], held[..., None], slopes)
-        loss = 1.0 - (axles.count * by_load[row, DRAWBAR] * by_pull).sum(axis=1)
-        less = axles.count[kind] * to_held[:, DRAWBAR] / loss
-        pull[row] += less
-        values[row] += by_load[row] * by_pull * less[:, None, None]
-        free[row, kind] = False
-    values[:, TORQUE] = np.where(free[:, :, None], values[:, TORQUE], np.minimum(values[:, TORQUE], limit))
-    return Balance(balance.slip, balance.known, columns)
 
 
 def largest_pull(balance: Balance, limits: Limits) -> Largest:

@@ -26,7 +26,6 @@ from soilbus.decision.balance import (
     Duty,
     Largest,
     Limits,
-    at_limits,
     axle_sum,
     balance,
     climbing,
@@ -233,7 +232,6 @@ def assess(
         present = level if flat else here.drawn(points)
         pull = draft if flat else vehicle.largest(duty, present)
         drafts.append(demand.pull - table.axles.weight * demand.sine)
-        present = at_limits(present, limits, table, duty)
         forecast = _forecast(demand, here, present, table.axles, rig, completed, points)
     grade, *with_draft = vehicle.grades(drafts)
     max_draft, max_pull, max_grade, max_grade_with_draft = estimates(
@@ -254,7 +252,7 @@ def assess(
         max_pull=max_pull,
         likely_pull=likely_pull and _with_mass_error(likely_pull, rig),
         limit=draft.cause,
-        set_points=_set_points(table.axles, level, limits),
+        set_points=_set_points(table.axles, level, vehicle.limits, draft),
         forecast=forecast,
         over_slip=_over_slip(level, table),
     ), table
@@ -281,7 +279,6 @@ class _Vehicle:
         Where the least slip already needs more torque than the limit, the wheels skid: the pull is negative, and only
         a push or a slope moves the vehicle.
         """
-        driving = at_limits(driving, self.limits, self.table, duty)
         found = largest_pull(driving, self.limits)
         if not self.table.axles.driven.any():
             return found._replace(cause="torque")
@@ -317,11 +314,8 @@ class _Vehicle:
         return slopes
 
 
-def _set_points(axles: Axles, level: Balance, limits: Limits) -> dict[str, SetPoint]:
-    """Slips of best efficiency P V / (T omega) and of largest pull, by axle; None for an axle that is not driven.
-
-    All wheels slip alike, so the first one at a limit ends them.
-    """
+def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:
+    """Slips of best efficiency P V / (T omega) and of largest pull, by axle; None for an axle that is not driven."""
     of_axles = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
     names = {name: driven for name, kinds in of_axles.items() if (driven := kinds & axles.driven[:, 0]).any()}
     none = {name: SetPoint(None, None) for name, kinds in of_axles.items() if kinds.any()}
@@ -332,9 +326,7 @@ def _set_points(axles: Axles, level: Balance, limits: Limits) -> dict[str, SetPo
         force = axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
         pull[:] = axle_sum(level.drawbar, axles, kinds)
         np.divide(pull * (1.0 - level.slip), np.where(force > 0.0, force, -np.inf), out=efficiency)
-    slips = estimates(
-        *slips_of_most(values.reshape(-1, *level.pull.shape), level, limits, largest_pull(level, limits).slip)
-    )
+    slips = estimates(*slips_of_most(values.reshape(-1, *level.pull.shape), level, limits, draft.slip))
     return none | {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
