@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from soilbus.config.model import Traversability as Settings
-from soilbus.decision.balance import Duty, Limits, at_limits, balance, largest_pull
+from soilbus.decision.balance import Duty, Limits, balance, largest_pull
 from soilbus.decision.capability import Demand, slip_grid
 from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Status
@@ -75,10 +75,7 @@ def test_spread_of_the_capability_equals_monte_carlo(name, limit):
     logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 2000)
     table = wheel_table(np.exp(logs), RIG, MODEL, slip_grid(DEFAULTS.max_slip))
     limits = Limits.of(table.axles, limit, DEFAULTS.max_sinkage, CompletedModel(MODEL))
-    drafts, pulls = (
-        largest_pull(at_limits(balance(table, duty), limits, table, duty), limits).pull
-        for duty in (Duty(), Duty(0.0, None))
-    )
+    drafts, pulls = (largest_pull(balance(table, duty), limits).pull for duty in (Duty(), Duty(0.0, None)))
     for estimate, sample in ((way.max_draft, drafts), (way.max_grade, np.arcsin(pulls / WEIGHT))):
         assert estimate.std == pytest.approx(np.std(sample), rel=0.1)  # sampling: 1.6 %
         assert estimate.value == pytest.approx(np.mean(sample), abs=0.1 * estimate.std)

@@ -268,8 +268,8 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     slip = slip + share * (balance.slip[after] - slip)
     none = ~usable[row, best]
     cause: Cause = "traction"
-    if best[0] == last:  # a wheel may be held at its limit there
-        cause = "torque" if (ends[0][0, :n_motors] >= limits.torque).any() else "slip"
+    if best[0] == last:
+        cause = "slip"
     elif more[0]:
         cause = "torque" if by_limit[0, :n_motors].min() <= by_limit[0, n_motors:].min() else "sinkage"
     return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
