@@ -8,7 +8,7 @@ import pytest
 from soilbus.estimation.assembly import effects_of, rig_of, with_effects
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
-from soilbus.pipeline.model_gap import SPAN, Square, Sums
+from soilbus.pipeline.model_gap import Square, Sums
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -54,7 +54,7 @@ def test_where_nothing_is_missing_no_gap_is_reported():
 
 
 def test_a_channel_counts_by_its_own_residuals_and_is_forgotten():
-    watch = Sums(SPAN)
+    watch = Sums(120.0)
     for t in range(100):
         watch.take(float(t), {"torque": Square(400.0, 400), "draft": Square(150.0, 100)})
     assert watch.ratios() == {"torque": pytest.approx(1.0), "draft": pytest.approx(1.5)}

@@ -12,7 +12,7 @@ P: pull given, P_hat: pull over slip of the last window (Kalman filter and regre
 The first three need no soil: a local linear trend follows q, V and sinkage, and slip that shakes widens
 it.  The others need the curve and some seconds of moments.  The moments are kept and seen along the newest curve: so a
 new window is no new ground.  Slip that grows as the draft does is the draft's, not the ground's.  Without a ground
-speed `stops` reckons one from acceleration and wheels, dV/dt = a + (r omega - V) / tau: it warns, and gives no all-clear.
+speed `stops` reckons one from acceleration and wheels, dV/dt = a + (r omega - V) / tau: it warns, but clears nothing.
 
 Spinning or stalling for `spin_time` overrules a go of the estimate; without any way for `stuck_time` the vehicle is
 stuck, until it has moved.
