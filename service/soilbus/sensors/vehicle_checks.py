@@ -53,15 +53,6 @@ def _weight(facts: Facts) -> Iterator[Finding]:
     draft, acceleration = (np.where(np.isfinite(a), a, 0.0) for a in (window.draft, window.acceleration))
     due = [median(np.broadcast_to(a, window.t.shape)) for a in axle_loads(chassis, draft, pitch, acceleration)]
     has = [median(window.load @ ahead) for ahead in (rig.ahead, 1.0 - rig.ahead)]
-    if max(has) > (1.0 + LIMITS.weight) * weight:
-        axle = "front" if has[0] > has[1] else "rear"
-        yield Finding(
-            f"the {axle} axle alone carries {max(has) / 1e3:.1f} kN, more than the weight of vehicle.mass ="
-            f" {chassis.mass:g} kg: mass, or unit or scale of the load?",
-            True,
-            names,
-        )
-        return
     weighed = [axle for axle in ("front", "rear") if f"load.{axle}" in facts.mapped]
     if len(weighed) == 1 and not facts.mapped & {*names}:
         side = ("front", "rear").index(weighed[0])
@@ -74,6 +65,15 @@ def _weight(facts: Facts) -> Iterator[Finding]:
                 names,
             )
             return
+    if max(has) > (1.0 + LIMITS.weight) * weight:
+        axle = "front" if has[0] > has[1] else "rear"
+        yield Finding(
+            f"the {axle} axle alone carries {max(has) / 1e3:.1f} kN, more than the weight of vehicle.mass ="
+            f" {chassis.mass:g} kg: mass, or unit or scale of the load?",
+            True,
+            names,
+        )
+        return
     if abs(has[0] - due[0]) > LIMITS.axle * weight:
         swapped = abs(has[0] - due[1]) < LIMITS.axle * weight
         yield Finding(
