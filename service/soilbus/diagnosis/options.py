@@ -30,7 +30,7 @@ class DiagnosisOptions:
     """Length [s] of an instant, the mean that models are fitted to: a machine that shakes is steady in the mean.  Over
     0.25 s a torque that is 40 ms late under swinging loads is not seen, over 0.05 s shaking passes for effects."""
     noise_rounds: int = 2
-    """Fits [1] after which noise floors are found anew: each kind's depends on those of the others in its residuals."""
+    """Fits [1] after which noise floors are estimated again, as each kind's depends on those of the others."""
 
     max_effects: int = 3
     """Effects that are added at most, and residual terms of a channel.  With 4 no value of the golden diagnoses moves,
