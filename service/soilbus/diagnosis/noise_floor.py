@@ -1,11 +1,11 @@
 """The noise floor: what the sensors do not repeat, by the recording itself.
 
-    sd^2 of a sensor = [noise]^2 * f,    f = sum of (v_i+k - v_i)^2 / sum of the same of expected squares
+    sd^2 of a sensor = [noise]^2 * f,    f = sum of (v_i - 2 v_i+k + v_i+2k)^2 / sum of the expected squares
 
-v are the sensor's corrections (`variance_components`) in bins that are one sample of it apart, not in the means over
-instants that models are fitted to.  What a model
-misses moves slowly beside the sampling, and differences cancel it (von Neumann 1941, Ann. Math. Stat. 12:367).  So f
-is that of the noise alone, whatever is missing.
+v are the sensor's corrections (`variance_components`) in bins, k bins are half of an instant, or a sample where that is
+longer.  What a model misses moves slowly beside an instant, and second differences cancel it (Gasser, Sroka &
+Jennen-Steinmetz 1986, Biometrika 73:625).  What shakes faster counts there about as much as in the mean of an instant.
+So f is what instants do not repeat, whatever is missing.
 """
 
 from __future__ import annotations
@@ -42,24 +42,26 @@ def noise_factors(records: Sequence[Record], prior: SoilPrior, fitted: FittedMod
         values, of_squares, columns = corrections(problem, at, fit.mode.gains)
         for kind, own in columns.items():
             value, expected = values[:, own], of_squares[:, own]
-            first, next_ = _neighbours(problem, KINDS[kind])
-            known = np.minimum(expected[first], expected[next_]) > 0.0
-            change = (value[next_] - value[first])[known]
-            of_noise = (expected[first] + expected[next_])[known]
-            found = np.array([float(change @ change), float(of_noise.sum()), len(first)])
+            before, here, after = _triples(problem, KINDS[kind], record.options.instant)
+            known = np.minimum(np.minimum(expected[before], expected[here]), expected[after]) > 0.0
+            bend = (value[before] - 2.0 * value[here] + value[after])[known]
+            of_noise = (expected[before] + 4.0 * expected[here] + expected[after])[known]
+            found = np.array([float(bend @ bend), float(of_noise.sum()), len(here)])
             squares[kind] = squares.get(kind, np.zeros(3)) + found
     least = records[0].training.options.variance.least_share
     return {
         kind: float(found / noise)
         for kind, (found, noise, n) in squares.items()
-        if KINDS[kind] and noise > 2.0 * least * n
+        if KINDS[kind] and noise > 6.0 * least * n
     }
 
 
-def _neighbours(problem: ObservationModel, quantities: Sequence[str]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of instants and of those that are one sample of these quantities later."""
+def _triples(
+    problem: ObservationModel, quantities: Sequence[str], instant: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Return the indices of bins, and of those half an instant [s] and an instant later, no less than samples apart."""
     step = float(np.median(np.diff(problem.t)))
-    k = max(round(max(map(problem.sample_time, quantities), default=0.0) / step), 1)
-    first = np.arange(max(problem.n - k, 0))
-    whole = np.abs(problem.t[first + k] - problem.t[first] - k * step) < 0.5 * step
-    return first[whole], first[whole] + k
+    k = max(round(max([instant / 2.0, *map(problem.sample_time, quantities)]) / step), 1)
+    first = np.arange(max(problem.n - 2 * k, 0))
+    whole = np.abs(problem.t[first + 2 * k] - problem.t[first] - 2 * k * step) < 0.5 * step
+    return first[whole], first[whole] + k, first[whole] + 2 * k

@@ -26,9 +26,10 @@ class DiagnosisOptions:
     """Instants that each part of a recording must have, and residuals of a channel or region that is judged.  With 4
     and 24 instants, and with 20 residuals, no value of the golden diagnoses moves."""
 
-    instant: float = 0.1
-    """Length [s] of an instant, the mean that models are fitted to: a machine that shakes is steady in the mean.  Over
-    0.25 s a torque that is 40 ms late under swinging loads is not seen, over 0.05 s shaking passes for effects."""
+    instant: float = 0.25
+    """Length [s] of an instant, the mean that models are fitted to, as the service's: a machine that shakes is steady
+    in the mean.  Over 0.1 s shaking passes for effects, and a hardpan and a springing rut under stale stamps are not
+    seen."""
     noise_rounds: int = 2
     """Fits [1] after which noise floors are estimated again, as each kind's depends on those of the others."""
 

@@ -30,7 +30,7 @@ class Curve(NamedTuple):
     """Values, slopes [1/s] and second derivatives [1/s^2] at ascending times t [s] (K,), cubics between them.
 
     slope_gain [1/s^2]: variance of a slope over that of a sample.  step [s] is the median one; half_width the number of
-    samples on each side of a fitted cubic (0: not smoothed).
+    samples on each side of a fitted cubic (0: not smoothed); parts the number of places of which it is the mean.
     """
 
     t: Array
@@ -40,6 +40,15 @@ class Curve(NamedTuple):
     slope_gain: Array
     step: float
     half_width: int
+    parts: int = 1
+
+    def averaged(self, length: float, parts: int) -> Curve:
+        """Return the curve of means over a length [s] about each time, by a number of places evenly spread over it."""
+        if parts < 2 or len(self.t) < 2:
+            return self
+        places = [self.t + length * ((i + 0.5) / parts - 0.5) for i in range(parts)]
+        value, slope, second = np.mean([self.at(place) for place in places], axis=0)
+        return self._replace(value=value, slope=slope, second=second, parts=parts)
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
         """Value, slope and second derivative at times t (N,) [s].
@@ -146,11 +155,15 @@ def variance_of_one(half: int, n: int, parts: int) -> float:
 
 
 class Instants(NamedTuple):
-    """Samples of an instant, steps from their middle to it, and the half width of the curve that its value is by."""
+    """Samples of an instant, steps from their middle to it, and the half width of the curve that its value is by.
+
+    parts: places of the instant, evenly spread over the samples, of which its value is the mean.
+    """
 
     samples: int
     phase: float
     half: int
+    parts: int = 1
 
 
 @lru_cache(256)
@@ -161,10 +174,10 @@ def kept_noise(half: int, instants: Instants, ahead: float, lag: float, low_pass
 
     With 1 the curve's noise adds to that of y or cancels some of it, and some shift seems to fit better.
     """
-    n, phase, of_value = instants
+    n, phase, of_value, parts = instants
     reach = max(half, of_value) + n + 2 + math.ceil(abs(phase) + abs(ahead) + 5.0 * low_pass)
-    rest, now, _ = _weights(of_value, n, phase, reach)
-    (_, here, _), (_, value, slope) = (_weights(half, n, at, reach) for at in (phase, phase + ahead))
+    rest, now, _ = _weights(of_value, n, phase, reach, parts)
+    (_, here, _), (_, value, slope) = (_weights(half, n, at, reach, parts) for at in (phase, phase + ahead))
     moved = (value + lag * slope)[::-1, None]  # a low pass looks back, at weights of samples before
     moved = through_low_pass(np.arange(float(len(moved))), moved, low_pass)[::-1, 0]
     off, total = rest + now - here, rest + now
@@ -172,10 +185,11 @@ def kept_noise(half: int, instants: Instants, ahead: float, lag: float, low_pass
     return (math.sqrt(max(shared**2 - own * rise, 0.0)) - shared) / own
 
 
-def _weights(half: int, n: int, ahead: float, reach: int) -> tuple[Array, Array, Array]:
+def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tuple[Array, Array, Array]:
     """Return weights of samples in what n of them have beside their curve, in its value, and in its slope by step.
 
-    Value and slope are `ahead` steps after the middle of the n samples, of which the first has index `reach`.
+    Value and slope are `ahead` steps after the middle of the n samples, of which the first has index `reach`, or means
+    over a number of parts, evenly spread over n steps about there.
     """
     weights, nothing = _cubics(half).weights[:, half], np.zeros((3, 2 * reach + n))
 
@@ -187,11 +201,14 @@ def _weights(half: int, n: int, ahead: float, reach: int) -> tuple[Array, Array,
 
     own = np.zeros(nothing.shape[1])
     own[reach : reach + n] = 1.0 / n
-    middle = (n - 1) / 2.0 + ahead
-    index = math.floor(middle)
-    share, one, first = np.full(len(own), middle - index), np.ones(len(own)), np.zeros(1, np.intp)
-    both = np.stack([weights_of(index), weights_of(index + 1)])
-    value, slope = (_hermite(share, one, both[:, k], both[:, k + 1], first)[0] for k in range(2))
+    of_parts = np.zeros((parts, 2, len(own)))
+    for part, (value, slope) in enumerate(of_parts):
+        middle = (n - 1) / 2.0 + ahead + n * ((part + 0.5) / parts - 0.5)
+        index = math.floor(middle)
+        share, one, first = np.full(len(own), middle - index), np.ones(len(own)), np.zeros(1, np.intp)
+        both = np.stack([weights_of(index), weights_of(index + 1)])
+        value[:], slope[:] = (_hermite(share, one, both[:, k], both[:, k + 1], first)[0] for k in range(2))
+    value, slope = of_parts.mean(0)
     return own - np.mean([weights_of(i)[0] for i in range(n)], axis=0), value, slope
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, straightened
 from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
-from soilbus.estimation.standing import STANDING, StandingColumns, standing_columns, standing_std
+from soilbus.estimation.standing import SLOPES, STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -195,22 +195,16 @@ class Measurements:
         """
         if self.rig.chassis is None:
             return self
-        window = self._curves.window
-        smooth = {
-            quantity: np.stack([curve.at(window.t)[0] for curve in self._curves.of(quantity)], axis=1)
-            for quantity in ("torque", "load", "speed", "ground_speed", "draft", "acceleration")
-        }
-        shaped: dict[str, Any] = {
-            quantity: values.reshape(getattr(window, quantity).shape) for quantity, values in smooth.items()
-        }
+        window, values, slopes = self._curves.window, dict[str, Any](), dict[str, Array]()
+        for quantity in (*SLOPES, "torque"):
+            smooth = np.stack([curve.at(window.t)[:2] for curve in self._curves.of(quantity)], axis=2)
+            values[quantity], slopes[quantity] = smooth.reshape(2, *getattr(window, quantity).shape)
         stamped, W = copy(self), self.n_wheels
         kept = np.searchsorted(window.t, self.t)
-        stamped._stand(standing_columns(replace(window, **shaped), self.rig), kept)
+        stamped._stand(standing_columns(replace(window, **values), self.rig, slopes), kept)
         own = np.zeros((*stamped.standing_rows.shape[:2], W))
-        slopes = np.nan_to_num(np.gradient(smooth["torque"], window.t, axis=0))[kept]
-        own[:, :W] = (
-            np.eye(W) * slopes[:, None] if self._torque_matrix is None else self._torque_matrix * slopes[:, None]
-        )
+        of_torque = np.nan_to_num(slopes["torque"])[kept, None]
+        own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque
         own[~self._known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
         nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
@@ -427,7 +421,7 @@ class Measurements:
         n = max(round(float(np.median(end - first))), 1)
         middle = curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step
         phase, *steps = (x / curve.step for x in (float(np.median(self.t - middle)), delay, tau, low_pass))
-        return kept_noise(curve.half_width, Instants(n, round(phase, 2), of_value), *steps)
+        return kept_noise(curve.half_width, Instants(n, round(phase, 2), of_value, curve.parts), *steps)
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""

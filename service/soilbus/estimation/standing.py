@@ -1,6 +1,7 @@
 """Standing parts of every model: what a machine in motion adds to steady wheel forces, and how late its sensors are.
 
-    slip       s + (L / V) ds/dt = 1 - V / (r omega)             relaxation length L of tyre and soil
+    slip       s + (L / V) ds/dt = 1 - V / (r omega)             relaxation length L of tyre and soil, so by L
+               omega + L (omega dV/dt / V - domega/dt) / V
     torque     T = T_soil + J domega/dt                          inertia J of a wheel
     channel    y(t) = x(t - d),   x = y + d dy/dt                d: lateness beside torque and wheel speed
 
@@ -14,6 +15,7 @@ Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,13 +24,15 @@ from soilbus.arrays import Array
 from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
-__all__ = ["STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
+__all__ = ["SLOPES", "STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
 
 STANDING = (
     "relaxation_length", "wheel_inertia", "lateness.load", "lateness.ground_speed", "lateness.draft",
     "lateness.acceleration",
 )  # fmt: skip
 """Names of the parameters, in order: [m], [1: in `wheel_inertia` units], [s]."""
+SLOPES = ("speed", "load", "ground_speed", "draft", "acceleration")
+"""Quantities whose slopes they act by."""
 
 
 class StandingColumns(NamedTuple):
@@ -54,25 +58,26 @@ def wheel_inertia(rig: Rig) -> Array:
     return np.asarray(rig.options.standing.wheel_mass_share * mass * rig.radius**2 / 2.0)
 
 
-def standing_columns(window: Window, rig: Rig) -> StandingColumns:
-    """Return the derivatives by STANDING at every bin of a completed window; 0 where a slope is not known."""
+def standing_columns(window: Window, rig: Rig, slopes: Mapping[str, Array] | None = None) -> StandingColumns:
+    """Return the derivatives by STANDING at every bin of a completed window; 0 where a slope is not known.
+
+    slopes: by time, of each of SLOPES, in its shape; by default the differences of neighbouring bins.
+    """
     N, W, S = len(window.t), len(rig.wheels), len(STANDING)
     columns = StandingColumns(np.zeros((N, W, S)), np.zeros((N, S)), np.zeros((N, 2 * W + 1, S)))
     if N < 3 or rig.chassis is None:
         return columns
-    ground = window.ground_speed[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slip = 1.0 - ground / (rig.radius * window.speed)
-        slopes = np.gradient(np.column_stack([
-            slip, window.speed, window.load, ground, window.draft, window.acceleration,
-        ]), window.t, axis=0)  # fmt: skip
-        slopes = np.where(np.isfinite(slopes), slopes, 0.0)  # of which a neighbour is unknown
-        relaxed = -slopes[:, :W] / ground * (rig.radius * window.speed**2 / ground)
+        if slopes is None:
+            slopes = {quantity: np.gradient(getattr(window, quantity), window.t, axis=0) for quantity in SLOPES}
+        speed, load, ground, draft, acceleration = (np.nan_to_num(slopes[quantity]) for quantity in SLOPES)
+        forward = window.ground_speed[:, None]
+        relaxed = (window.speed / forward * ground[:, None] - speed) / forward
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
-    columns.torque[:, :, 1] = -wheel_inertia(rig) * slopes[:, W : 2 * W]
-    columns.latents[:, :W, 2] = slopes[:, 2 * W : 3 * W] if _measures_loads(rig) else 0.0
-    columns.latents[:, 2 * W, 3], columns.demand[:, 4] = slopes[:, 3 * W], slopes[:, 3 * W + 1]
-    columns.demand[:, 5] = rig.chassis.mass * slopes[:, 3 * W + 2]
+    columns.torque[:, :, 1] = -wheel_inertia(rig) * speed
+    columns.latents[:, :W, 2] = load if _measures_loads(rig) else 0.0
+    columns.latents[:, 2 * W, 3], columns.demand[:, 4] = ground, draft
+    columns.demand[:, 5] = rig.chassis.mass * acceleration
     return columns
 
 
