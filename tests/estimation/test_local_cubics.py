@@ -67,11 +67,17 @@ def value_and_slope(noise, half, place):
     return between(a, b, left, right), between(left, right, bend, next_bend)
 
 
-def noise_of_instants(noise, half, n, phase, middle):
+def mean_value(noise, half, place, n, parts):
+    """Mean of curves (M,) over parts, evenly spread over n samples about a place."""
+    places = [place + n * ((part + 0.5) / parts - 0.5) for part in range(parts)]
+    return np.mean([value_and_slope(noise, half, one)[0] for one in places], axis=0)
+
+
+def noise_of_instants(noise, half, n, phase, middle, parts=1):
     """What noise adds to values at instants by n samples about a place and the curve there."""
     own = np.arange(n) + int(round(middle - (n - 1) / 2.0))
     rest = np.mean([noise[:, k] - value_and_slope(noise, half, k)[0] for k in own], axis=0)
-    return rest + value_and_slope(noise, half, middle + phase)[0]
+    return rest + mean_value(noise, half, middle + phase, n, parts)
 
 
 @pytest.mark.parametrize("half", [2, 4, 9])
@@ -84,16 +90,27 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
 
 
 @pytest.mark.parametrize("half", [3, 9])
-@pytest.mark.parametrize(("n", "phase"), [(1, 0.25), (2, 0.0), (2, -0.5)])
-@pytest.mark.parametrize(("ahead", "lag"), [(0.4, 0.0), (-0.4, 0.0), (1.7, 0.0), (-9.0, 0.0), (3.0, 0.3)])
-def test_a_shift_along_a_curve_leaves_the_noise_of_instants_as_large_as_it_is(half, n, phase, ahead, lag):
+@pytest.mark.parametrize(("n", "phase", "parts"), [(1, 0.25, 1), (2, 0.0, 1), (2, -0.5, 1), (6, 0.0, 3)])
+@pytest.mark.parametrize("ahead", [0.4, -0.4, 1.7, -9.0, 3.0])
+def test_a_shift_along_a_curve_leaves_the_noise_of_instants_as_large_as_it_is(half, n, phase, parts, ahead):
     """Else a sound channel seems late, as some shift leaves smaller residuals."""
     noise, middle = np.random.default_rng(6).standard_normal((100_000, 60)), 30.0 + (n - 1) / 2.0
-    now = noise_of_instants(noise, half, n, phase, middle)
-    off = now - value_and_slope(noise, half, middle + phase)[0]
-    value, slope = value_and_slope(noise, half, middle + phase + ahead)
-    kept = kept_noise(half, Instants(n, phase, half), ahead, lag)
-    assert (kept * off + value + lag * slope).var() == pytest.approx(now.var(), rel=0.03)
+    now = noise_of_instants(noise, half, n, phase, middle, parts)
+    off = now - mean_value(noise, half, middle + phase, n, parts)
+    kept = kept_noise(half, Instants(n, phase, half, parts), ahead)
+    shifted = kept * off + mean_value(noise, half, middle + phase + ahead, n, parts)
+    assert shifted.var() == pytest.approx(now.var(), rel=0.03)
+
+
+def test_an_averaged_curve_is_that_of_means():
+    """Of a sine, means over a length are smaller by sin(x) / x, x half the length's phase."""
+    t, length, f = 0.02 * np.arange(400), 0.24, 1.3
+    curve = curve_of(t, np.sin(2.0 * np.pi * f * t), np.full(400, 1e-8)).averaged(length, 12)
+    at = np.linspace(1.0, 6.0, 77)
+    phase = 2.0 * np.pi * f * at
+    x = np.pi * f * length
+    assert curve.at(at)[0] == pytest.approx(np.sin(x) / x * np.sin(phase), abs=2e-3)
+    assert curve.at(at)[1] == pytest.approx(np.sin(x) / x * 2.0 * np.pi * f * np.cos(phase), abs=2e-2)
 
 
 def store_of(shake: float, step: float = 0.02) -> Bins:

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from soilbus.allocator import keep_freed_memory
-from soilbus.diagnosis.delays import with_delays
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.gap import Gap, gap_of
@@ -29,7 +28,7 @@ from soilbus.diagnosis.search import Addition, FitCache, Search
 from soilbus.diagnosis.verdict import Verdict, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
-from soilbus.terra.effects.effect import Effect
+from soilbus.terra.effects.effect import Effect, Late
 from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
 __all__ = ["Diagnosis", "NotFitted", "diagnose"]
@@ -150,9 +149,6 @@ def diagnose(
     for step in search.steps():
         additions, present = step
         progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
-    if any(effect.late for effect in present.effects):
-        progress("separating delays from low passes")
-        present = with_delays(records, prior, present)
     if (
         not present.converged and not present.held_out_chi2 < base.held_out_chi2
     ):  # such an end has no evidence, and predicts worse
@@ -163,7 +159,7 @@ def diagnose(
         full = FitCache(records, prior, options)
         again = full.fit(base.effects, [base.as_starts()]), full.fit(present.effects, [present.as_starts()])
         if again[0] is not None and again[1] is not None:
-            base, present = again[0], replace(again[1], reported=present.reported)
+            base, present = again[0], again[1]
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     before, after = gap_of(base), gap_of(present)
     imitation = shares_alone(full, base, present, additions)
@@ -235,11 +231,15 @@ def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:
     """The effect as it can be seen in these recordings.
 
     Beside a pitch sensor a slope is measured.  A channel that does not move shows no delay: one would only smooth its
-    noise.
+    noise.  A low pass delays by its time constant: drives determine the sum of both, and hardly either.
     """
     if effect.late:
-        late = {q: names for q, names in effect.late.items() if any(record.training.moves(q) for record in records)}
-        kept = {name for names in late.values() for name in names}
+        late = {
+            quantity: Late(names.delay)
+            for quantity, names in effect.late.items()
+            if any(record.training.moves(quantity) for record in records)
+        }
+        kept = {names.delay for names in late.values()}
         return replace(effect, late=late, parameters=tuple(p for p in effect.parameters if p.name in kept))
     with_pitch = all(record.training.with_pitch for record in records)
     return GRADE_BESIDE_PITCH if with_pitch and effect is GRADE else effect

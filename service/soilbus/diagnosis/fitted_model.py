@@ -11,8 +11,8 @@ alone leaves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -118,8 +118,6 @@ class FittedModel:
         Of each recording.
     blocks
         Scores of all blocks of all recordings, in the order of these.
-    reported
-        Estimates by effect and parameter that replace the Gaussian ones, where the posterior is not Gaussian.
     """
 
     effects: tuple[Effect, ...]
@@ -129,7 +127,6 @@ class FittedModel:
     fits: tuple[Fit, ...]
     checks: tuple[HeldOutCheck, ...]
     blocks: BlockScores
-    reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,8 +189,6 @@ class FittedModel:
             self.free, self.parameter_names(), gaussian.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True
         ):
             out[free.effect][name] = Estimate(free.at(standardised), free.std * spread)
-        for (effect, name), estimate in self.reported.items():
-            out[effect][name] = estimate
         return out
 
     def prior_parameters(self) -> dict[str, dict[str, Estimate]]:

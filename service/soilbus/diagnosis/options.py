@@ -81,14 +81,6 @@ class DiagnosisOptions:
     significance: float = 0.01
     """Probability under noise alone, corrected for all tests, below which a disagreement is reported."""
 
-    delay_step: float = 0.005
-    """Half the span of sums [s] that a parabola goes through.  With 0.02 one delay of the golden diagnoses moves."""
-    error_of_parts: float = 0.1
-    """Further sd of a part of a delay, as a share of the sum [1]: what moves faster than a channel's interpolating
-    curve is not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py).
-    """
-    error_of_sum: float = 0.02
-    """The same of the sum [1]."""
     delay_sure_sd: float = 3.0
     """Deviations by which a delay exceeds a sample time to be a name: of a thousand sound channels one does by noise.
     """

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.delays import total_delays
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.gap import gap_of
 from soilbus.diagnosis.joint_fit import Start
@@ -208,10 +207,10 @@ class Search:
     def _is_within_a_cycle(self, model: FittedModel) -> bool:
         """Whether the last effect delays no channel by more than its sample time, for sure: stamps do that."""
         effect = model.effects[-1]
+        found, problem = model.parameters()[effect.name], self.full.records[-1].training
         return bool(effect.late) and not any(
-            abs(total.value) - self.options.delay_sure_sd * total.std
-            > self.full.records[-1].training.sample_time(quantity)
-            for quantity, total in total_delays(model, effect).items()
+            found[late.delay].value - self.options.delay_sure_sd * found[late.delay].std > problem.sample_time(quantity)
+            for quantity, late in effect.late.items()
         )
 
     def _falls_short(self, without: FittedModel, model: FittedModel) -> bool:

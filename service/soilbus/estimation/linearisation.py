@@ -178,15 +178,12 @@ class DelayTerms(NamedTuple):
 
     torque (N, W) [N m], measured (N, 2 W + 1) of the latents and demand (N,) [N] are the
     measurements without delay less those taken; by_torque (P, N, W), by_measured and
-    by_demand are their derivatives.  predicted (N, W) [N m] is the model's torque after a low
-    pass less that before; by_predicted (P, N, W) its derivatives.
+    by_demand are their derivatives.
     """
 
     torque: Array
     measured: Array
     demand: Array
-    predicted: Array
     by_torque: Array
     by_measured: Array
     by_demand: Array
-    by_predicted: Array

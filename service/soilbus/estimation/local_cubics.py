@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.terra.effects.along import through_low_pass
 
 HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 """Numbers of samples on each side that are tried; with two a cubic averages at all."""
@@ -150,7 +149,7 @@ def variance_of_one(half: int, n: int, parts: int) -> float:
     The value is the mean of the samples less the curve's mean there, plus the curve at the
     instant, which is `parts` / `PHASE_PARTS` steps after the middle of the samples.
     """
-    rest, value, _ = _weights(half, n, parts / PHASE_PARTS, half + n + 2)
+    rest, value = _weights(half, n, parts / PHASE_PARTS, half + n + 2)
     return float(((rest + value) ** 2).sum())
 
 
@@ -167,29 +166,27 @@ class Instants(NamedTuple):
 
 
 @lru_cache(256)
-def kept_noise(half: int, instants: Instants, ahead: float, lag: float, low_pass: float = 0.0) -> float:
+def kept_noise(half: int, instants: Instants, ahead: float) -> float:
     """Return the factor c by which a shift along a curve s leaves the noise of instants y as large as it is.
 
-        var(c (y - s(0)) + s(ahead) + lag s'(ahead)) = var(y)        ahead, lag, low_pass (that s passes) in steps
+        var(c (y - s(0)) + s(ahead)) = var(y)        ahead in steps
 
     With 1 the curve's noise adds to that of y or cancels some of it, and some shift seems to fit better.
     """
     n, phase, of_value, parts = instants
-    reach = max(half, of_value) + n + 2 + math.ceil(abs(phase) + abs(ahead) + 5.0 * low_pass)
-    rest, now, _ = _weights(of_value, n, phase, reach, parts)
-    (_, here, _), (_, value, slope) = (_weights(half, n, at, reach, parts) for at in (phase, phase + ahead))
-    moved = (value + lag * slope)[::-1, None]  # a low pass looks back, at weights of samples before
-    moved = through_low_pass(np.arange(float(len(moved))), moved, low_pass)[::-1, 0]
+    reach = max(half, of_value) + n + 2 + math.ceil(abs(phase) + abs(ahead))
+    rest, now = _weights(of_value, n, phase, reach, parts)
+    (_, here), (_, moved) = (_weights(half, n, at, reach, parts) for at in (phase, phase + ahead))
     off, total = rest + now - here, rest + now
     own, shared, rise = (float(x) for x in (off @ off, off @ moved, moved @ moved - total @ total))
     return (math.sqrt(max(shared**2 - own * rise, 0.0)) - shared) / own
 
 
-def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tuple[Array, Array, Array]:
-    """Return weights of samples in what n of them have beside their curve, in its value, and in its slope by step.
+def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tuple[Array, Array]:
+    """Return weights of samples in what n of them have beside their curve, and in its value.
 
-    Value and slope are `ahead` steps after the middle of the n samples, of which the first has index `reach`, or means
-    over a number of parts, evenly spread over n steps about there.
+    The value is `ahead` steps after the middle of the n samples, of which the first has index `reach`, or the mean over
+    a number of parts, evenly spread over n steps about there.
     """
     weights, nothing = _cubics(half).weights[:, half], np.zeros((3, 2 * reach + n))
 
@@ -199,17 +196,15 @@ def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tup
         weights_at[:, reach + index - half : reach + index + half + 1] = weights
         return weights_at
 
-    own = np.zeros(nothing.shape[1])
+    own, value = np.zeros((2, nothing.shape[1]))
     own[reach : reach + n] = 1.0 / n
-    of_parts = np.zeros((parts, 2, len(own)))
-    for part, (value, slope) in enumerate(of_parts):
+    for part in range(parts):
         middle = (n - 1) / 2.0 + ahead + n * ((part + 0.5) / parts - 0.5)
         index = math.floor(middle)
         share, one, first = np.full(len(own), middle - index), np.ones(len(own)), np.zeros(1, np.intp)
         both = np.stack([weights_of(index), weights_of(index + 1)])
-        value[:], slope[:] = (_hermite(share, one, both[:, k], both[:, k + 1], first)[0] for k in range(2))
-    value, slope = of_parts.mean(0)
-    return own - np.mean([weights_of(i)[0] for i in range(n)], axis=0), value, slope
+        value += _hermite(share, one, both[:, 0], both[:, 1], first)[0] / parts
+    return own - np.mean([weights_of(i)[0] for i in range(n)], axis=0), value
 
 
 def powers(steps: Array) -> Array:

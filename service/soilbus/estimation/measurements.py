@@ -397,22 +397,15 @@ class Measurements:
         curves = self._curves.window.curves
         return max((curves[name].step for name in names if name in curves), default=0.0)
 
-    def shifted(self, quantity: str, column: int, curve: Curve, delay: float, tau: float) -> Array:
-        """Return by how much a column of a quantity (N,) changes where a delay and a low pass [s] are taken out."""
-        value, slope, _ = curve.at(self.t + delay)
-        off, kept = self.off_curve(quantity, column, curve), self.kept_noise(quantity, column, curve, delay, tau)
-        return np.asarray(value + tau * slope - curve.at(self.t)[0] + (kept - 1.0) * off)
-
-    def off_curve(self, quantity: str, column: int, curve: Curve) -> Array:
-        """Return what a column of a quantity has beside its curve (N,)."""
+    def shifted(self, quantity: str, column: int, curve: Curve, delay: float) -> Array:
+        """Return by how much a column of a quantity (N,) changes where a delay [s] is taken out."""
         t = self._curves.window.t
         values = getattr(self._curves.window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
-        return np.asarray(values - curve.at(self.t)[0])
+        here, kept = curve.at(self.t)[0], self._kept_noise(quantity, column, curve, delay)
+        return np.asarray(curve.at(self.t + delay)[0] - here + (kept - 1.0) * (values - here))
 
-    def kept_noise(
-        self, quantity: str, column: int, curve: Curve, delay: float, tau: float, low_pass: float = 0.0
-    ) -> float:
-        """Return the factor on what is beside a curve, with which a shift [s] keeps the noise of instants."""
+    def _kept_noise(self, quantity: str, column: int, curve: Curve, delay: float) -> float:
+        """Return the factor on what is beside a curve, with which a delay [s] keeps the noise of instants."""
         of_value = self._curves.of(quantity)[column].half_width
         if not (curve.half_width and of_value and self.n > 1):
             return 1.0
@@ -420,8 +413,8 @@ class Measurements:
         first, end = (np.searchsorted(curve.t, self.t + part * length) for part in (-0.5, 0.5))
         n = max(round(float(np.median(end - first))), 1)
         middle = curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step
-        phase, *steps = (x / curve.step for x in (float(np.median(self.t - middle)), delay, tau, low_pass))
-        return kept_noise(curve.half_width, Instants(n, round(phase, 2), of_value, curve.parts), *steps)
+        phase = round(float(np.median(self.t - middle)) / curve.step, 2)
+        return kept_noise(curve.half_width, Instants(n, phase, of_value, curve.parts), delay / curve.step)
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""

@@ -103,7 +103,7 @@ class ObservationModel(Measurements):
         torque = self.torque_rows(at.value[1])
 
         of_torque, of_latents, of_draft, of_mass, corrected, variance, row_var = self._corrected(gains)
-        delay = self.delay_terms(gains, latents, at.value[1])
+        delay = self.delay_terms(gains)
         draft, inertia = self.draft * of_draft, self.inertia * of_mass
 
         rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
@@ -132,7 +132,7 @@ class ObservationModel(Measurements):
         if delay is not None:
             residual += self.delay_residuals(delay, A, gains)
             by_delay = delay.by_measured * of_latents
-            by_effects[:, torques] += (of_torque * delay.by_torque - delay.by_predicted).transpose(1, 2, 0)
+            by_effects[:, torques] += (of_torque * delay.by_torque).transpose(1, 2, 0)
             by_effects[:, balance] += delay.by_demand.T
             by_effects += np.einsum("nml,pnl->nmp", A, by_delay)
         side_load = self._side_load(A, at.value[1], now)
@@ -343,8 +343,8 @@ class ObservationModel(Measurements):
         corrected, variance = self._measured * of_latents, self._measured_var * of_latents**2
         return of_torque, of_latents, of_draft, of_mass, corrected, variance, row_var
 
-    def delay_terms(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
-        """Corrections for delays at gains (G,) and latents; torque (N, W) [N m] is the model's.  None without."""
+    def delay_terms(self, gains: Array) -> DelayTerms | None:
+        """Corrections for delays at gains (G,); None without."""
         return None
 
     def delay_residuals(self, delay: DelayTerms | None, A: Array, gains: Array) -> Array:
@@ -352,7 +352,7 @@ class ObservationModel(Measurements):
         residual, layout = np.zeros(A.shape[:2]), self.layout
         if delay is not None:
             gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
-            residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains] - delay.predicted
+            residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains]
             residual[:, layout.balance] = delay.demand
             residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
             residual[~self._known] = 0.0

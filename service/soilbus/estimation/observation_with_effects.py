@@ -1,7 +1,7 @@
 """Observation model with effects: the hooks of effects in torque, draft balance and sinkage, and delays of channels.
 
 gains     sensor gains | effect parameters, standardised: (value - prior value) / prior sd
-delayed   y(t + d) in place of y(t), through a low pass where the effect has one
+delayed   y(t + d) in place of y(t)
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
-from soilbus.terra.effects.along import through_low_pass
 from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.tangent import forces_along
 from soilbus.terra.vehicle import GRAVITY
@@ -37,9 +36,6 @@ from soilbus.terra.wheel import (
     state_on,
     wheel_forces,
 )
-
-_TORQUE_POWERS = tuple((i, j) for i in range(3) for j in range(5))
-"""Powers of load and slip in the polynomial for torques: within 0.1 % of the model's over a recording."""
 
 _DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
 _SOIL_NAMES = Soil._fields
@@ -89,8 +85,7 @@ class ObservationModelWithEffects(ObservationModel):
         fitted = {(f.effect, f.parameter.name) for f in self.free if f.std > 0.0}
         late = [q for e in self.effects for q, names in e.late.items() if (e.name, names.delay) in fitted]
         names, std = [name.split(".") for name in self.gain_names[: self.n_sensors]], self.sensor_std.copy()
-        for quantity in late:  # of torques the first one's: the others' may differ from it
-            std[next((i for i, name in enumerate(names) if name[:2] == ["lateness", quantity]), len(std)) :][:1] = 0.0
+        std[[i for i, name in enumerate(names) if name[0] == "lateness" and name[1] in late and len(name) == 2]] = 0.0
         return std
 
     def active(self, standardised: Array) -> list[Active]:
@@ -225,36 +220,29 @@ class ObservationModelWithEffects(ObservationModel):
             length=self.length,
         )
 
-    def delay_terms(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
-        """Corrections for measurements y late by d and by a low pass of tau: x(t) = (1 + tau d/dt) y(t + d).
+    def delay_terms(self, gains: Array) -> DelayTerms | None:
+        """Corrections for measurements y that are late by d: x(t) = y(t + d).
 
         y(t + d) = s(t + d) + c (y(t) - s(t)) with the smooth curve s of the measurements (see
         local_cubics): the noise of an instant stays with it, and c keeps its variance.  Else every
         delay would pair other noises or cancel a part, and some would seem to fit better.
-        Torques are predicted by the model: there the low pass and the derivatives act on the
-        prediction, since slopes of measurements have noise that would count as information.
+        A low pass delays by its time constant.
         """
         places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
         standardised, P = gains[self.layout.effects], len(self.free)
         found: dict[str, tuple[Array, Array]] = {}
-        predicted, by_predicted = np.zeros_like(torque), np.zeros((P, *torque.shape))
         for effect in self.effects:
-            for quantity, (delay, time_constant) in effect.late.items():
-                at = places[effect.name, delay], places[effect.name, time_constant]
-                if all(self.free[i].std == 0.0 and self.free[i].value == 0.0 for i in at):
+            for quantity, names in effect.late.items():
+                own = [(i, self.free[i]) for name in names if (i := places.get((effect.name, name))) is not None]
+                if all(f.std == 0.0 and f.value == 0.0 for _, f in own):
                     continue
                 added, by = found.setdefault(quantity, self._no_delay(quantity, P))
-                d, tau = (self.free[i].at(float(standardised[i])) for i in at)
-                std, of_tau = (self.free[i].std for i in at)
-                if quantity == "torque":
-                    predicted, rate, by_tau = self._low_pass_terms(tau, latents, torque)
-                    by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
-                    tau, std, of_tau = 0.0, 0.0, 0.0
+                d = sum(f.at(float(standardised[i])) for i, f in own)
                 for column, curve in enumerate(self._curves.of(quantity)):
-                    _, slope, second = curve.at(self.t + d)
-                    added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d, tau))
-                    by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
-                    by[at[1], :, column] += of_tau * np.nan_to_num(slope)
+                    added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d))
+                    slope = np.nan_to_num(curve.at(self.t + d)[1])
+                    for i, f in own:
+                        by[i, :, column] += f.std * slope
         if not found:
             return None
         torques, load, ground, draft, pitch = (
@@ -272,54 +260,10 @@ class ObservationModelWithEffects(ObservationModel):
             torque=self.torque_rows(torques[0]),
             measured=measured,
             demand=draft[0][:, 0] + weight * pitch[0][:, 0],
-            predicted=self.torque_rows(predicted),
             by_torque=self.torque_rows(torques[1]),
             by_measured=by_measured,
             by_demand=draft[1][:, :, 0] + weight * pitch[1][:, :, 0],
-            by_predicted=self.torque_rows(by_predicted),
         )
-
-    def _low_pass_terms(self, tau: float, latents: Latents, torque: Array) -> tuple[Array, Array, Array]:
-        """Change [N m] of the model's torques (N, W) by a low pass of tau [s]; their slope after it; derivative by tau.
-
-        Between instants and where some are left out, torques follow from the curves of loads
-        and speeds by a polynomial in load and slip through the model's own torques.
-        """
-        off, slope, by_tau = (np.zeros(torque.shape) for _ in range(3))
-        loads, speeds, (ground,) = (self._curves.of(q) for q in ("load", "speed", "ground_speed"))
-        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        for w, (load, speed) in enumerate(zip(loads, speeds, strict=True)):
-            used = self.usable[:, w]
-            if len(load.t) < 2 or np.count_nonzero(used) < 2 * len(_TORQUE_POWERS):
-                continue
-            states = np.stack([latents.load[used, w], slip[used, w]])
-            middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
-            basis = _monomials((states - middle) / size)
-            by_power = np.linalg.lstsq(basis, torque[used, w], rcond=None)[0]
-
-            def along_at(latents: Array, w: int = w, states: Array = states, by_power: Array = by_power) -> Array:
-                """Torques (N,) at load, speed and ground speed (3, N)."""
-                rim = np.maximum(self.rig.radius[w] * latents[1], 1e-3)
-                path = np.clip(np.stack([latents[0], 1.0 - latents[2] / rim]).T, *np.sort(states)[:, [0, -1]].T).T
-                middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
-                return np.asarray(_monomials((path - middle) / size) @ by_power)
-
-            along = along_at(np.stack([load.value, speed.at(load.t)[0], ground.at(load.t)[0]]))
-            filtered = through_low_pass(load.t, along[:, None], tau)
-            rate = (along[:, None] - filtered) / tau if tau > 0.0 else np.gradient(along, load.t)[:, None]
-            behind = through_low_pass(load.t, rate, tau)
-            change = np.interp(self.t, load.t, filtered[:, 0] - along)
-            curves = [("load", w, load), ("speed", w, speed), ("ground_speed", 0, ground)]
-            smooth = np.stack([curve.at(self.t)[0] for _, _, curve in curves])
-            noisy = smooth.copy()
-            for row, (quantity, column, curve) in zip(noisy, curves, strict=True):  # noise stays as large as it is
-                kept = self.kept_noise(quantity, column, curve, 0.0, 0.0, tau)
-                row += (kept - 1.0) * np.nan_to_num(self.off_curve(quantity, column, curve))
-            change += along_at(noisy) - along_at(smooth)
-            off[:, w] = np.nan_to_num(change) * used
-            slope[:, w] = np.interp(self.t, load.t, rate[:, 0]) * used
-            by_tau[:, w] = -np.interp(self.t, load.t, behind[:, 0]) * used
-        return off, slope, by_tau
 
     def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Zero corrections (N, columns) and derivatives (P, N, columns)."""
@@ -403,14 +347,6 @@ def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) 
             else:
                 by_soil[i, _SOIL_NAMES.index(quantity)] = d
     return at, by_latents, by_soil, by_effects
-
-
-def _monomials(states: Array) -> Array:
-    """Products (N, len(_TORQUE_POWERS)) of powers of load and slip (2, N)."""
-    load, slip = (
-        [value**i for i in range(highest + 1)] for value, highest in zip(states, _TORQUE_POWERS[-1], strict=True)
-    )
-    return np.stack([load[i] * slip[j] for i, j in _TORQUE_POWERS], axis=1)
 
 
 def _varied(soil: Soil) -> Soil:

@@ -241,7 +241,6 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
 def _unit_of(name: str, effect: Effect) -> str:
     """The unit of a parameter, or of a wheel's own, to be written after its value."""
     units = {parameter.name: parameter.unit for parameter in effect.parameters}
-    units |= {late.total: "s" for late in effect.late.values()}
     unit = units.get(name) or units[name.rpartition("_")[0]]
     return "" if unit == "1" else f" {unit}"
 

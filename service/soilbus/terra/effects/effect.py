@@ -91,15 +91,10 @@ ErrorHook = Callable[[Surroundings, Values], Any]
 
 
 class Late(NamedTuple):
-    """Names of the parameters [s] by which a channel is late: a dead time, and the time constant of a low pass."""
+    """Names of the parameters [s] by which a channel is late: a dead time, and a low pass's time constant if any."""
 
     delay: str
-    time_constant: str
-
-    @property
-    def total(self) -> str:
-        """Name of their sum, which data tell best: a low pass delays by its time constant."""
-        return self.delay.removesuffix("delay") + "total"
+    time_constant: str = ""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ DRAFT_GAIN = Effect(
 
 def late_by(values: Values, late: Late) -> float:
     """Return the total delay [s] of a channel: its dead time plus the time constant of its lag."""
-    return float(values[late.delay]) + float(values[late.time_constant])
+    return float(values[late.delay]) + float(values.get(late.time_constant, 0.0))
 
 
 def lateness(active: Sequence[Active]) -> dict[str, float]:
@@ -81,7 +81,7 @@ def read_late(truth: Array, t: Array, values: Values, late: Late) -> Array:
     first, second, part = earlier(t, values[late.delay])
     part = part[:, None]
     queued = (1.0 - part) * truth[first] + part * truth[second]
-    return through_low_pass(t, queued, values[late.time_constant])
+    return through_low_pass(t, queued, values.get(late.time_constant, 0.0))
 
 
 _DELAY_AND_LAG = "delay and first-order lag of a channel: Ljung, System Identification (2nd ed. 1999)"
