@@ -333,7 +333,7 @@ def fit_model(
     n_sensors = records[0].training.n_sensors
     own = own_gains(n_sensors, effects, free)
     with np.errstate(all="ignore"):
-        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own, n_sensors)
+        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own, n_sensors, options=records[0].options)
     return FittedModel(tuple(effects), free, free_unheld, priors, tuple(fits), tuple(checks), blocks)
 
 

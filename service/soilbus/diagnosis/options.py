@@ -30,6 +30,9 @@ class DiagnosisOptions:
     """Length [s] of an instant, the mean that models are fitted to, as the service's: a machine that shakes is steady
     in the mean.  Over 0.1 s shaking passes for effects, and a hardpan and a springing rut under stale stamps are not
     seen."""
+    gain_left_out: float = 0.99
+    """Share [1] of a sensor gain's prior that is predicted as a block is: what no data determine keeps ten times its
+    sd."""
     noise_rounds: int = 2
     """Fits [1] after which noise floors are estimated again, as each kind's depends on those of the others."""
 
