@@ -148,6 +148,15 @@ def test_a_time_at_the_top_of_its_signal_is_said_to_be_longer(desk):
         assert said in desk.text("engineer", SIZES[0])
 
 
+def test_an_age_that_is_not_known_does_not_deny_the_last_valid_estimate(desk):
+    for age, since, said in (
+        (None, None, "no estimate"), (None, 13.1, "valid 13.1 s ago"), (0.4, None, "data 0.4 s old"),
+    ):  # fmt: skip
+        desk.clock.now += 0.1
+        desk.send("Traversability", **WHOLE["Traversability"] | {"Age": age, "SinceValid": since})
+        assert desk.text("driver", SIZES[0]).splitlines()[-1].split("  ")[0] == said
+
+
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize("size", SIZES + SMALLER)
 def test_no_line_is_longer_than_the_terminal_is_wide_and_no_page_higher(desk, name, size):

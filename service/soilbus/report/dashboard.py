@@ -140,13 +140,15 @@ class Slip(NamedTuple):
 class Dashboard:
     """Received frames and their last minute, as the dashboard shows them.
 
-    `fault` says why the bus is away; it is empty while it is there. Charts show the last `span` seconds.
+    `fault` says why the bus is away; it is empty while it is there. `is_over` says that the recording has ended.
+    Charts show the last `span` seconds.
     """
 
     known: ReceivedFrames
     vehicle: Vehicle = field(default_factory=Vehicle)
     fault: str = ""
     span: float = 60.0
+    is_over: bool = False
     _samples: deque[tuple[float, dict[str, float]]] = field(default_factory=deque, repr=False)
     _began: float = math.nan
 
@@ -307,12 +309,14 @@ class Dashboard:
         return now + (f" {before}{force(most, unit)}" if most is not None else f" {before}{unknown}" * bool(unknown))
 
     def freshness(self) -> str:
-        """Return the age of the data behind the verdict."""
+        """Return the age of the data behind the verdict, or that the recording has ended."""
+        if self.is_over:
+            return "end of the recording"
         age, since = (self.known.number("Traversability", name) for name in ("Age", "SinceValid"))
-        if age is None:
-            return "no data"
         more = "over " if self.known.is_at_top("Traversability", "SinceValid") else ""
-        return f"data {age:.1f} s old" + ("" if since is None else f", valid {more}{since:.1f} s ago")
+        said = [] if age is None else [f"data {age:.1f} s old"]
+        said += [] if since is None else [f"valid {more}{since:.1f} s ago"]
+        return ", ".join(said) or "no estimate"
 
     def sentences(self) -> list[str]:
         """Return the state, what to do, slip, draft, age, and why the bus is away; each where it is known."""
