@@ -242,6 +242,30 @@ def test_a_caution_that_only_waits_for_a_second_window_asks_for_no_less_draft(de
     assert said == {0.94: "Less draft, more load", 0.97: "Go slowly, caution is held"}
 
 
+@pytest.mark.parametrize("state", ["go", "caution"])
+def test_a_slip_above_the_best_gets_a_word_beside_go_and_a_held_caution(desk, state):
+    said = {}
+    for slip in (0.1, 0.4):
+        desk.send("Traversability", State=state, LimitingCause="slip", Probability=0.97)
+        desk.send("WheelSlip", SlipWheel1=slip)
+        desk.send("TractionAdvice", **WHOLE["TractionAdvice"] | {"Status": "valid"})
+        said[slip] = "slip above best" in desk.dashboard.verdict().todo
+    assert said == {0.1: False, 0.4: True}
+
+
+@pytest.mark.parametrize("warning", ["none", "immobilisation"])
+@pytest.mark.parametrize("state", ["caution", "no_go"])
+def test_a_vehicle_that_pulls_nothing_is_not_told_to_lift_or_to_reduce_the_draft(desk, state, warning):
+    said = {}
+    for draft in (3000.0, 0.0, -40.0):
+        desk.send("Traversability", State=state, LimitingCause="slip", Probability=0.5)
+        desk.send("DemandForecast", Warning=warning, TimeLeft=6.0)
+        desk.send("PresentDemand", Draft=draft)
+        said[draft] = desk.dashboard.verdict().todo
+    assert re.search("draft|lift", said[3000.0], re.I)
+    assert said[0.0] == said[-40.0] == ("Stop" if state == "no_go" else "Go slowly") + ", add no torque"
+
+
 def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():
     said = {}
     for reason in set(REASONS) - {"none", "model_gap", "error", "not_available"}:
@@ -481,6 +505,11 @@ def test_draft_and_slope_that_nobody_measures_are_no_zero(desk):
     desk.send_all(PresentDemand={"Draft": None, "Slope": None}, TractionLimits={"Status": "valid"})
     assert re.search(r"DRAFT  -  of possible 5\.9 kN", desk.text("driver"))
     assert re.search(r"now +- +-\s", desk.text("engineer"))
+
+
+def test_a_slip_that_rounds_to_zero_has_no_sign(desk):
+    desk.send("WheelSlip", **dict.fromkeys(WHOLE["WheelSlip"], -0.004))
+    assert "SLIP  0 % at wheel FL" in desk.text("driver")
 
 
 def test_slopes_are_in_per_cent(desk):

@@ -7,6 +7,7 @@ It reads only our frames, as any dashboard ECU would, and judges them by the rul
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -41,13 +42,16 @@ ADVICE = {
     ("no_go", "slip"): "Stop, lift the implement",
     ("no_go", "sinkage"): "Stop, turn off soft ground",
     ("no_go", None): "Stop, lift the implement",
+    ("go", "stuck"): "Lift, add no torque",
+    ("caution", "stuck"): "Lift, add no torque",
+    ("no_go", "stuck"): "Stop, lift, add no torque",
+    ("unknown", "stuck"): "Stop, lift, add no torque",
 }
-"""What to do by state and limiting cause, in at most five words."""
-WARNED_ADVICE = "Stop, lift, add no torque"
-MOVING_ADVICE = "Lift, add no torque"
-"""The same while the state still lets the vehicle go on: a stop would contradict it."""
+"""What to do by state and limiting cause, in at most five words: a stop only where the state does not say go on."""
+UNLADEN = "Go slowly, add no torque", "Stop, add no torque"
+"""The same without and with a stop, where nothing is pulled and the advice would name draft or implement."""
 HELD = "Go slowly, caution is held"
-ABOVE_BEST = "Keep going, slip above best"
+ABOVE_BEST = {"go": "Keep going, slip above best", "caution": "Go slowly, slip above best"}
 GONE_ADVICE = "Rely on your own judgement"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
@@ -205,19 +209,27 @@ class Dashboard:
             left = known.number("DemandForecast", "TimeLeft")
             when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
             what = "stuck" if is_stuck else f"getting stuck{when}"
-            todo = MOVING_ADVICE if state in ("go", "caution") else WARNED_ADVICE
-            return Verdict("STUCK", f"{NAMES[state]}: {what}", todo, "warned")
+            return Verdict("STUCK", f"{NAMES[state]}: {what}", self._advice(state, "stuck"), "warned")
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
-        limit = known.value("Traversability", "LimitingCause")
-        todo = ADVICE.get((state, str(limit)), ADVICE[state, None])
-        if state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
-            todo = HELD  # nothing limits it: more windows must say the same
-        worst = self.slip()
-        if state == "go" and worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
-            todo = ABOVE_BEST
+        todo = self._advice(state, str(known.value("Traversability", "LimitingCause")))
+        is_held = state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go
+        if state == "go" or is_held:  # nothing limits it; what is held waits for more windows that say the same
+            worst = self.slip()
+            if worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
+                todo = ABOVE_BEST[state]
+            elif is_held:
+                todo = HELD
         return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
+
+    def _advice(self, state: str, cause: str) -> str:
+        """Return what to do by state and limiting cause, or `stuck`."""
+        said = ADVICE.get((state, cause)) or ADVICE[state, None]
+        draft = self.known.number("PresentDemand", "Draft")
+        if draft is None or draft > 0.0 or not re.search("draft|lift", said, re.IGNORECASE):
+            return said
+        return UNLADEN[said.startswith("Stop")]
 
     def _because(self) -> Iterator[str]:
         """Probability and limit of a known state."""
@@ -254,7 +266,8 @@ class Dashboard:
             return "the draft is not heard any more" if was_there else "no sensor shows the draft", "Go carefully"
         slip = self.slip().value
         if reason == "standstill" and slip is not None and slip >= CARRYING_SLIP:
-            return "the wheels spin", WARNED_ADVICE  # they make no way, so the service calls it a standstill
+            # they make no way, so the service calls it a standstill
+            return "the wheels spin", self._advice("unknown", "stuck")
         if reason in REASONS:
             return REASONS[reason]
         if known.value("SoilbusStatus", "State") == "estimating":
@@ -334,7 +347,7 @@ class Dashboard:
 
 def percent(share: float) -> str:
     """Return a share or a slip in per cent."""
-    return f"{100.0 * share:.0f} %"
+    return f"{round(100.0 * share)} %"
 
 
 def is_above(share: float, other: float) -> bool:

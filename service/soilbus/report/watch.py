@@ -220,7 +220,7 @@ def show(
 def _show_lines(
     dashboard: Dashboard, source: Source, console: Console, done: Callable[[], bool], clock: Callable[[], float]
 ) -> None:
-    """A line at once when the state or what to do changes, else at most one a second and only where it differs."""
+    """Print a line at once when the state or the first words of what to do change, else one a second at most."""
     last, said, line_due, redraw = "", None, clock(), clock() + REDRAW_PERIOD
     while not done():
         _take(dashboard, source, redraw - clock())
@@ -229,8 +229,9 @@ def _show_lines(
         redraw = clock() + REDRAW_PERIOD
         dashboard.sample()
         verdict, line = dashboard.verdict(), ". ".join(dashboard.sentences()) + "."
-        if line != last and ((verdict.kind, verdict.todo) != said or clock() >= line_due):
-            last, said, line_due = line, (verdict.kind, verdict.todo), clock() + LINE_PERIOD
+        now_said = verdict.kind, verdict.todo.partition(",")[0]
+        if line != last and (now_said != said or clock() >= line_due):
+            last, said, line_due = line, now_said, clock() + LINE_PERIOD
             console.print(Text(line), soft_wrap=True)
             console.file.flush()
 
