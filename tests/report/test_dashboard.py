@@ -232,14 +232,27 @@ def test_what_to_do_has_at_most_five_words_and_the_sentence_begins_with_the_stat
     assert {verdict.kind for *_, verdict in seen} == {"go", "caution", "no_go", "unknown", "warned", "gone"}
 
 
-def test_a_caution_that_only_waits_for_a_second_window_asks_for_no_less_draft(desk):
+@pytest.mark.parametrize(
+    ("state", "limited", "held"),
+    [
+        ("caution", "Less draft, more load", "Go slowly, caution is held"),
+        ("no_go", "Stop, lift the implement", "Stop, no-go is held"),
+    ],
+)
+def test_a_state_that_only_waits_for_a_second_window_asks_for_no_less_draft(desk, state, limited, held):
     """The first good window after a no-go: probable enough for go, and held back by hysteresis alone."""
     said = {}
     for probability in (0.94, 0.97):
         desk.send("SoilbusStatus", State="valid", Reason="none", Window=3)
-        desk.send("Traversability", State="caution", LimitingCause="traction", Probability=probability)
+        desk.send("Traversability", State=state, LimitingCause="traction", Probability=probability)
         said[probability] = desk.dashboard.verdict().todo
-    assert said == {0.94: "Less draft, more load", 0.97: "Go slowly, caution is held"}
+    assert said == {0.94: limited, 0.97: held}
+
+
+def test_no_negative_draft_is_said_to_be_possible(desk):
+    desk.send("PresentDemand", Draft=1600.0)
+    desk.send("TractionLimits", **WHOLE["TractionLimits"] | {"MaxDraft": -480.0, "Status": "valid"})
+    assert desk.dashboard.sentences()[2] == "Draft 1.6 kN of 0.0 kN"
 
 
 @pytest.mark.parametrize("state", ["go", "caution"])

@@ -50,7 +50,7 @@ ADVICE = {
 """What to do by state and limiting cause, in at most five words: a stop only where the state does not say go on."""
 UNLADEN = "Go slowly, add no torque", "Stop, add no torque"
 """The same without and with a stop, where nothing is pulled and the advice would name draft or implement."""
-HELD = "Go slowly, caution is held"
+HELD = {"caution": "Go slowly, caution is held", "no_go": "Stop, no-go is held"}
 ABOVE_BEST = {"go": "Keep going, slip above best", "caution": "Go slowly, slip above best"}
 GONE_ADVICE = "Rely on your own judgement"
 MEASURING = "Go slowly, still measuring"
@@ -214,13 +214,11 @@ class Dashboard:
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
         todo = self._advice(state, str(known.value("Traversability", "LimitingCause")))
-        is_held = state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go
-        if state == "go" or is_held:  # nothing limits it; what is held waits for more windows that say the same
+        if state == "go" or (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
+            todo = HELD.get(state, todo)  # nothing limits it: more windows must say the same
             worst = self.slip()
             if worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
-                todo = ABOVE_BEST[state]
-            elif is_held:
-                todo = HELD
+                todo = ABOVE_BEST.get(state, todo)
         return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
 
     def _advice(self, state: str, cause: str) -> str:
@@ -310,8 +308,9 @@ class Dashboard:
         return [i for i, is_known in enumerate(has_value) if i < named or is_known]
 
     def max_draft(self) -> float | None:
-        """Return the largest draft [N] here and now, while it may be acted on."""
-        return self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
+        """Return the largest draft [N] here and now, while it may be acted on; 0 where it is stuck without any."""
+        most = self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
+        return None if most is None else max(most, 0.0)
 
     def draft_of(self, draft: float, before: str = "of ", unknown: str = "") -> str:
         """Return the draft [N] and the largest one in one unit; a negative draft brakes."""
