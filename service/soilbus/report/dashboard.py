@@ -207,7 +207,7 @@ class Dashboard:
             moves = slip is not None and slip < CARRYING_SLIP
             is_stuck = state == "no_go" and known.number("Traversability", "Probability") == 0.0 and not moves
             left = known.number("DemandForecast", "TimeLeft")
-            when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
+            when = "" if left is None or left >= TOP_TIME_LEFT else " now" if round(left) == 0 else f" in {left:.0f} s"
             what = "stuck" if is_stuck else f"getting stuck{when}"
             return Verdict("STUCK", f"{NAMES[state]}: {what}", self._advice(state, "stuck"), "warned")
         if state == "unknown":
