@@ -131,6 +131,14 @@ def test_init_proposes_the_mapping_and_asks_for_units_that_no_name_says(folder, 
     assert re.search(r'(?m)^load = \{signal = "WheelLoads FL", unit = "\?"', capsys.readouterr().out)
 
 
+def test_init_maps_each_role_that_the_library_writes_by_its_own_name(folder, tmp_path, capsys):
+    table = soilbus.signals(folder / "drive.log", TRACTOR)
+    table.to_csv(tmp_path / "own.csv")
+    assert main(["init", "--table", str(tmp_path / "own.csv")]) == 0
+    mapped = set(re.findall(r'(?m)^[^#\n]*"(\S+ \[[^"]*\])"', capsys.readouterr().out))
+    assert {*table.columns, table.index.name} - mapped == set()
+
+
 def test_check_compares_a_table_with_the_configuration(folder, capsys):
     assert main(["check", "--config", str(folder / "table.toml"), "--log", str(folder / "drive.csv")]) == 0
     out = capsys.readouterr().out
