@@ -204,8 +204,11 @@ def test_a_comma_that_may_part_thousands_is_no_decimal_comma(rows, tmp_path):
 def test_files_that_are_no_tables_are_named(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR0 nothing of the kind")
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "a.xlsx").touch()
+    (tmp_path / "empty.csv").touch()
     for name, complaint in (
-        ("none.csv", "No such file"), ("a.xlsx", "not a table"), ("a.csv", "not CSV"), ("a.parquet", "Parquet"),
+        ("none.csv", "No such file"), ("none.xlsx", "No such file"), ("a.xlsx", "not a table"), ("a.csv", "not CSV"),
+        ("a.parquet", "Parquet"), ("empty.csv", "no row in it"),
     ):  # fmt: skip
         with pytest.raises(TableError, match=complaint):
             runs_of(rig(), tmp_path / name)

@@ -63,9 +63,10 @@ def read_columns(path: Path, needed: Sequence[str] | None) -> Columns:
     """
     readers = {".csv": _csv, ".parquet": _parquet, ".pq": _parquet}
     reader = _csv if str(path) == "-" else readers.get(kind_of(path))
-    if reader is None:
-        raise TableError(f"{path}: not a table: {', '.join(readers)} can be read")
     try:
+        if reader is None:
+            path.stat()  # what is not there has no kind
+            raise TableError(f"{path}: not a table: {', '.join(readers)} can be read")
         return reader(path, needed)
     except OSError as error:
         raise TableError(f"{path}: {error.strerror or one_line(error, 100)}") from None
@@ -79,7 +80,9 @@ def kind_of(path: Path) -> str:
 
 def _csv(path: Path, needed: Sequence[str] | None) -> Columns:
     rows, separator = _csv_rows(path, needed or ())
-    header = [name.strip() for name in rows[0]] if rows else []
+    if not rows:
+        raise TableError(f"{path}: no row in it")
+    header = [name.strip() for name in rows[0]]
     needed = header if needed is None else needed
     check_columns(path, header, needed)
     for i, row in enumerate(rows[1:], 1):
