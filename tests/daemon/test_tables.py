@@ -149,7 +149,7 @@ def test_rows_follow_their_times(tmp_path, measured):
         ("load,slip,pull,torque,sink\n1,0.1,inf,3,0\n", "row 1, column pull: 'inf' is not a number"),
         ("load,slip,pull,torque,sink\n1,0.1,2\n", "row 1 has 3 cells under a header of 5"),
         ("load,slip,pull,torque,sink\n", "no row in it"),
-        ("", "it has none"),
+        ("", "no row in it"),
         ("load,slip,pull,torque,sink\n1,,2,3,0\n", "no usable row in it \\(no_slip\\)"),
         ('load,slip\n"1,0.1\n', "not CSV text"),
     ],
