@@ -280,6 +280,8 @@ def deltas(row: Row) -> str:
         ("PAR1", "a Parquet table, without CAN frames"),
         ("MDF     3.30", "an MDF file of version 3"),
         ("\0\1\2", "binary data of no known format"),
+        (";\0 1,2", "binary data of no known format"),
+        ("".join(f"({9.0 - 0.1 * i:.6f}) can0 123#0102\n" for i in range(60)), "its stamps go backwards"),
         ("", "no frame in it"),
     ],
 )  # fmt: skip

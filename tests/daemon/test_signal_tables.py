@@ -95,6 +95,8 @@ def test_what_is_no_number_is_refused_and_counted_and_the_rest_is_used(folder, t
         (lambda frame: frame.iloc[:, :3], "no column"),
         (lambda frame: frame.assign(**{"time [s]": "soon"}), "holds no time"),
         (lambda frame: frame.iloc[:0], "no value in it"),
+        (lambda frame: frame.iloc[::-1], "goes backwards"),
+        (lambda frame: frame.sample(frac=1.0, random_state=1), "goes backwards"),
     ],
 )
 def test_a_table_that_cannot_be_used_is_one_line(change, complaint, folder, tmp_path, capsys):
@@ -104,7 +106,19 @@ def test_a_table_that_cannot_be_used_is_one_line(change, complaint, folder, tmp_
     assert complaint in line
 
 
-def test_times_may_be_dates_or_milliseconds(folder, expected, tmp_path):
+@pytest.mark.parametrize(("unit", "seconds"), [("ms", 1e-3), ("min", 60.0)])
+def test_the_unit_of_the_times_ends_the_name_of_their_column(unit, seconds, folder, expected, tmp_path):
+    frame = pd.read_csv(folder / "drive.csv")
+    frame = frame.rename(columns={"time [s]": f"time [{unit}]"})
+    frame[f"time [{unit}]"] = (frame[f"time [{unit}]"] - frame[f"time [{unit}]"].iloc[0]) / seconds
+    text = (folder / "table.toml").read_text().replace("time [s]", f"time [{unit}]")
+    (tmp_path / "table.toml").write_text(text)
+    got = windows(frame, tmp_path)
+    assert got["status"].tolist() == expected["status"].tolist()
+    np.testing.assert_allclose(got["t"], expected["t"] - expected["t"].iloc[0] + got["t"].iloc[0], atol=1e-3)
+
+
+def test_times_may_be_dates(folder, expected, tmp_path):
     frame = pd.read_csv(folder / "drive.csv")
     dates = frame.assign(**{"time [s]": pd.to_datetime(frame["time [s]"], unit="s").astype(str)})
     got = windows(dates, folder)
@@ -129,6 +143,14 @@ def test_init_proposes_the_mapping_and_asks_for_units_that_no_name_says(folder, 
     frame.rename(columns=lambda name: name.partition(" [")[0]).to_csv(tmp_path / "bare.csv", index=False)
     assert main(["init", "--table", str(tmp_path / "bare.csv")]) == 0
     assert re.search(r'(?m)^load = \{signal = "WheelLoads FL", unit = "\?"', capsys.readouterr().out)
+
+
+def test_init_maps_each_role_that_the_library_writes_by_its_own_name(folder, tmp_path, capsys):
+    table = soilbus.signals(folder / "drive.log", TRACTOR)
+    table.to_csv(tmp_path / "own.csv")
+    assert main(["init", "--table", str(tmp_path / "own.csv")]) == 0
+    mapped = set(re.findall(r'(?m)^[^#\n]*"(\S+ \[[^"]*\])"', capsys.readouterr().out))
+    assert {*table.columns, table.index.name} - mapped == set()
 
 
 def test_check_compares_a_table_with_the_configuration(folder, capsys):

@@ -149,7 +149,7 @@ def test_rows_follow_their_times(tmp_path, measured):
         ("load,slip,pull,torque,sink\n1,0.1,inf,3,0\n", "row 1, column pull: 'inf' is not a number"),
         ("load,slip,pull,torque,sink\n1,0.1,2\n", "row 1 has 3 cells under a header of 5"),
         ("load,slip,pull,torque,sink\n", "no row in it"),
-        ("", "it has none"),
+        ("", "no row in it"),
         ("load,slip,pull,torque,sink\n1,,2,3,0\n", "no usable row in it \\(no_slip\\)"),
         ('load,slip\n"1,0.1\n', "not CSV text"),
     ],
@@ -204,8 +204,11 @@ def test_a_comma_that_may_part_thousands_is_no_decimal_comma(rows, tmp_path):
 def test_files_that_are_no_tables_are_named(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR0 nothing of the kind")
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "a.xlsx").touch()
+    (tmp_path / "empty.csv").touch()
     for name, complaint in (
-        ("none.csv", "No such file"), ("a.xlsx", "not a table"), ("a.csv", "not CSV"), ("a.parquet", "Parquet"),
+        ("none.csv", "No such file"), ("none.xlsx", "No such file"), ("a.xlsx", "not a table"), ("a.csv", "not CSV"),
+        ("a.parquet", "Parquet"), ("empty.csv", "no row in it"),
     ):  # fmt: skip
         with pytest.raises(TableError, match=complaint):
             runs_of(rig(), tmp_path / name)

@@ -148,6 +148,15 @@ def test_a_time_at_the_top_of_its_signal_is_said_to_be_longer(desk):
         assert said in desk.text("engineer", SIZES[0])
 
 
+def test_an_age_that_is_not_known_does_not_deny_the_last_valid_estimate(desk):
+    for age, since, said in (
+        (None, None, "no estimate"), (None, 13.1, "valid 13.1 s ago"), (0.4, None, "data 0.4 s old"),
+    ):  # fmt: skip
+        desk.clock.now += 0.1
+        desk.send("Traversability", **WHOLE["Traversability"] | {"Age": age, "SinceValid": since})
+        assert desk.text("driver", SIZES[0]).splitlines()[-1].split("  ")[0] == said
+
+
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize("size", SIZES + SMALLER)
 def test_no_line_is_longer_than_the_terminal_is_wide_and_no_page_higher(desk, name, size):
@@ -223,14 +232,51 @@ def test_what_to_do_has_at_most_five_words_and_the_sentence_begins_with_the_stat
     assert {verdict.kind for *_, verdict in seen} == {"go", "caution", "no_go", "unknown", "warned", "gone"}
 
 
-def test_a_caution_that_only_waits_for_a_second_window_asks_for_no_less_draft(desk):
+@pytest.mark.parametrize(
+    ("state", "limited", "held"),
+    [
+        ("caution", "Less draft, more load", "Go slowly, caution is held"),
+        ("no_go", "Stop, lift the implement", "Stop, no-go is held"),
+    ],
+)
+def test_a_state_that_only_waits_for_a_second_window_asks_for_no_less_draft(desk, state, limited, held):
     """The first good window after a no-go: probable enough for go, and held back by hysteresis alone."""
     said = {}
     for probability in (0.94, 0.97):
         desk.send("SoilbusStatus", State="valid", Reason="none", Window=3)
-        desk.send("Traversability", State="caution", LimitingCause="traction", Probability=probability)
+        desk.send("Traversability", State=state, LimitingCause="traction", Probability=probability)
         said[probability] = desk.dashboard.verdict().todo
-    assert said == {0.94: "Less draft, more load", 0.97: "Go slowly, caution is held"}
+    assert said == {0.94: limited, 0.97: held}
+
+
+def test_no_negative_draft_is_said_to_be_possible(desk):
+    desk.send("PresentDemand", Draft=1600.0)
+    desk.send("TractionLimits", **WHOLE["TractionLimits"] | {"MaxDraft": -480.0, "Status": "valid"})
+    assert desk.dashboard.sentences()[2] == "Draft 1.6 kN of 0.0 kN"
+
+
+@pytest.mark.parametrize("state", ["go", "caution"])
+def test_a_slip_above_the_best_gets_a_word_beside_go_and_a_held_caution(desk, state):
+    said = {}
+    for slip in (0.1, 0.4):
+        desk.send("Traversability", State=state, LimitingCause="slip", Probability=0.97)
+        desk.send("WheelSlip", SlipWheel1=slip)
+        desk.send("TractionAdvice", **WHOLE["TractionAdvice"] | {"Status": "valid"})
+        said[slip] = "slip above best" in desk.dashboard.verdict().todo
+    assert said == {0.1: False, 0.4: True}
+
+
+@pytest.mark.parametrize("warning", ["none", "immobilisation"])
+@pytest.mark.parametrize("state", ["caution", "no_go"])
+def test_a_vehicle_that_pulls_nothing_is_not_told_to_lift_or_to_reduce_the_draft(desk, state, warning):
+    said = {}
+    for draft in (3000.0, 0.0, -40.0):
+        desk.send("Traversability", State=state, LimitingCause="slip", Probability=0.5)
+        desk.send("DemandForecast", Warning=warning, TimeLeft=6.0)
+        desk.send("PresentDemand", Draft=draft)
+        said[draft] = desk.dashboard.verdict().todo
+    assert re.search("draft|lift", said[3000.0], re.I)
+    assert said[0.0] == said[-40.0] == ("Stop" if state == "no_go" else "Go slowly") + ", add no torque"
 
 
 def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():
@@ -472,6 +518,11 @@ def test_draft_and_slope_that_nobody_measures_are_no_zero(desk):
     desk.send_all(PresentDemand={"Draft": None, "Slope": None}, TractionLimits={"Status": "valid"})
     assert re.search(r"DRAFT  -  of possible 5\.9 kN", desk.text("driver"))
     assert re.search(r"now +- +-\s", desk.text("engineer"))
+
+
+def test_a_slip_that_rounds_to_zero_has_no_sign(desk):
+    desk.send("WheelSlip", **dict.fromkeys(WHOLE["WheelSlip"], -0.004))
+    assert "SLIP  0 % at wheel FL" in desk.text("driver")
 
 
 def test_slopes_are_in_per_cent(desk):

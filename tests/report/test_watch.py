@@ -220,6 +220,20 @@ def test_keys_turn_pages_and_leave_the_terminal_as_it_was(tmp_path: Path):
     os.close(terminal.far)
 
 
+def test_the_last_page_of_a_recording_stands_until_a_key_ends_it(tmp_path: Path):
+    log = tmp_path / "ours.log"
+    write_log(sent(3.0), log)
+    terminal = Terminal(str(log), "--speed", "10")
+    terminal.until("end of the recording")
+    time.sleep(1.0)  # 10 s of the recording: frames would be stale
+    terminal.press("e")
+    assert "GO, p = 0.99" in terminal.until("gap (chi-square)")
+    terminal.press("q")
+    assert terminal.process.wait(timeout=20.0) == 0
+    os.close(terminal.near)
+    os.close(terminal.far)
+
+
 def watched(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "soilbus", "watch", *arguments], capture_output=True, text=True, timeout=60, check=False

@@ -522,11 +522,11 @@ def with_changed(
 HILLS = tuple((4.0 * i, 0.08 * (-1.0) ** i) for i in range(30))
 
 
-def of_wheels(recording: Recording, wheels: Sequence[str] = WHEELS) -> dict[str, Any]:
-    """The ground speed that a controller computes from these wheels."""
+def of_wheels(recording: Recording, wheels: Sequence[str] = WHEELS, late: float = 0.0) -> dict[str, Any]:
+    """The ground speed that a controller computes from these wheels, late by so many seconds."""
     ground = recording.channels["ground_speed"]
     rims = [
-        np.interp(ground.t, own.t, own.value) * radius
+        np.interp(ground.t - late, own.t, own.value) * radius
         for own, radius in ((recording.channels[f"speed.{w}"], 0.5 if w[0] == "F" else 0.62) for w in wheels)
     ]
     return {"ground_speed": np.mean(rims, axis=0)}
@@ -541,6 +541,7 @@ def scaled(name: str, factor: float) -> Callable[[Recording], dict[str, Any]]:
     [
         (of_wheels, (), "signals.ground_speed: goes with the "),
         (lambda r: of_wheels(r, ("RL", "RR")), (), "signals.ground_speed: goes with the rear wheels"),
+        (lambda r: of_wheels(r, ("RL", "RR"), late=0.15), (), "signals.ground_speed: goes with the rear wheels"),
         (scaled("draft", 0.1), (), "scale of the draft"),
         (scaled("draft", 1.0 / 9.80665), (), "kgf or daN where the DBC says N"),
         (scaled("acceleration", 10.0), (), "signals.acceleration: changes"),
@@ -587,6 +588,15 @@ def test_an_accelerometer_without_gravity_said_to_feel_it_is_named():
     heard = with_changed(lambda recording: {}, HILLS)
     assert beside(reference_configuration(), heard).findings == ()
     assert any('kind = "kinematic"' in fault for fault in beside(config, heard).faults)
+
+
+@pytest.mark.parametrize(("factor", "is_told"), [(1.0, False), (0.9, False), (1.1, True)])
+def test_a_wheel_that_rolls_freely_may_skid_and_does_not_drive(factor, is_told):
+    config = reference_configuration(path=REAR_DRIVE)
+    wheels = [w if w.driven else w.model_copy(update={"radius": factor * w.radius}) for w in config.wheel]
+    found = beside(config.model_copy(update={"wheel": wheels}), with_changed(lambda recording: {}, (), REAR_DRIVE))
+    assert any("rolls freely, but its rim goes 1.0" in warning for warning in found.warnings) == is_told
+    assert not any("rolls freely" in fault for fault in found.faults)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.0 / 9.80665])

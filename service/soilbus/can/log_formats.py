@@ -64,6 +64,8 @@ def format_of(head: bytes) -> Format:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines:
         return Format("an empty file", lambda _: iter(()))
+    if "\0" in text:
+        raise ValueError("binary data of no known format")
     first = lines[0]
     if first.startswith("***BUSMASTER"):
         return Format("BUSMASTER log", lambda stream: busmaster(text_lines(stream)))
@@ -75,7 +77,7 @@ def format_of(head: bytes) -> Format:
         return Format("Vector ASC log", lambda stream: asc(text_lines(stream)))
     if any(map(is_candump, lines)):
         return Format("candump log", lambda stream: candump_batches(text_lines(stream)))
-    if "\0" in text or "\ufffd" in text:
+    if "\ufffd" in text:
         raise ValueError("binary data of no known format")
     if columns := [cell for cell in re.split("[,;\t]", first) if cell.strip()][1:]:
         raise ValueError(f"a table, whose {len(columns) + 1} columns are not those of CAN frames; {OF_SIGNALS}")

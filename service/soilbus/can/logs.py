@@ -235,11 +235,13 @@ def _listed(names: Collection[str]) -> str:
 
 
 def _check_stamps(stamps: list[float]) -> None:
-    """Raise ValueError where the first stamps of a log only say how long after the frame before each came."""
+    """Raise ValueError where the first stamps go backwards, or only say how long after the frame before each came."""
     backwards = sum(later < earlier for earlier, later in pairwise(stamps))
     half = len(stamps) // 2
     if len(stamps) < LEAST_STAMPS or backwards <= MOST_BACKWARDS * len(stamps):
         return
+    if max(stamps[half:]) < min(stamps[:half]):
+        raise ValueError("its stamps go backwards: put its frames in the order of time")
     if median(stamps[half:]) < max(stamps[:half]):
         raise ValueError(
             "its stamps are relative to the frame before, as candump -td writes them: record with absolute ones (-ta)"

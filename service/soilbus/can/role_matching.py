@@ -151,7 +151,7 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
         _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"},
     ),
     "acceleration": (
-        ("acceleration",), 0.1, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
+        ("acceleration",), 0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
         _ASKED | {"lateral", "vertical", "limit"},
     ),
     "steering_angle": (

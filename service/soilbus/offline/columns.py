@@ -23,7 +23,7 @@ from soilbus.arrays import Array
 from soilbus.can.candump import Frame
 from soilbus.can.columns import mapped_columns, unit_in
 from soilbus.can.log_formats import check_mf4_blocks, placed_copy
-from soilbus.can.logs import LogError
+from soilbus.can.logs import LEAST_STAMPS, MOST_BACKWARDS, LogError
 from soilbus.config.model import Columns as TimeColumn
 from soilbus.config.model import Config
 from soilbus.files import LIMITS, opened, packing, plain_bytes, read_all, text_lines
@@ -42,7 +42,10 @@ PACKED = (".gz", ".bz2", ".xz", ".zst")
 """Ends of the names of packed files."""
 TIME_NAMES = re.compile(r"t|time|times?tamp|date_?time|date|zeit|uhrzeit|seconds|sekunden|index", re.IGNORECASE)
 """First word of the name of a column of times."""
-_TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+_TIMES = {
+    "s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9,
+    "min": 60.0, "h": 3600.0,
+}  # fmt: skip
 """Seconds by the unit of a column of times."""
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
@@ -63,9 +66,10 @@ def read_columns(path: Path, needed: Sequence[str] | None) -> Columns:
     """
     readers = {".csv": _csv, ".parquet": _parquet, ".pq": _parquet}
     reader = _csv if str(path) == "-" else readers.get(kind_of(path))
-    if reader is None:
-        raise TableError(f"{path}: not a table: {', '.join(readers)} can be read")
     try:
+        if reader is None:
+            path.stat()  # what is not there has no kind
+            raise TableError(f"{path}: not a table: {', '.join(readers)} can be read")
         return reader(path, needed)
     except OSError as error:
         raise TableError(f"{path}: {error.strerror or one_line(error, 100)}") from None
@@ -79,7 +83,9 @@ def kind_of(path: Path) -> str:
 
 def _csv(path: Path, needed: Sequence[str] | None) -> Columns:
     rows, separator = _csv_rows(path, needed or ())
-    header = [name.strip() for name in rows[0]] if rows else []
+    if not rows:
+        raise TableError(f"{path}: no row in it")
+    header = [name.strip() for name in rows[0]]
     needed = header if needed is None else needed
     check_columns(path, header, needed)
     for i, row in enumerate(rows[1:], 1):
@@ -300,17 +306,24 @@ def _date(cell: Any) -> float | None:
 
 
 def _times(path: Path, time: TimeColumn, cells: Sequence[Any]) -> Array:
-    """Times [s], inf where a cell has none."""
-    values = np.array([math.inf if isinstance(cell, datetime) else number(cell) for cell in cells], np.float64)
-    if np.isfinite(values).any():
+    """Times [s], inf where a cell has none; TableError where there is none, or many are before the one before."""
+    times = np.array([math.inf if isinstance(cell, datetime) else number(cell) for cell in cells], np.float64)
+    if np.isfinite(times).any():
         ending = re.search(r"(?:^|[\[( _/])([a-zµμ]+)[\])]?\s*$", time.time)
         unit = time.unit or (ending[1] if ending and ending[1] in _TIMES else "s")
-        return np.asarray(np.where(np.isfinite(values), values * _TIMES[unit], math.inf))
-    dates = [_date(cell) for cell in cells]
-    if dates and not any(date is not None for date in dates):
-        seen = f"{shown(cells[0], 40)!r} is neither a number nor a date as 2026-05-01T12:00:00.1"
-        raise TableError(f"{path}: column {time.time} holds no time: {seen}")
-    return np.array([math.inf if date is None else date for date in dates], np.float64)
+        times = np.where(np.isfinite(times), times * _TIMES[unit], math.inf)
+    else:
+        dates = [_date(cell) for cell in cells]
+        if dates and not any(date is not None for date in dates):
+            seen = f"{shown(cells[0], 40)!r} is neither a number nor a date as 2026-05-01T12:00:00.1"
+            raise TableError(f"{path}: column {time.time} holds no time: {seen}")
+        times = np.array([math.inf if date is None else date for date in dates], np.float64)
+    backwards = int((np.diff(times[np.isfinite(times)]) < 0.0).sum())
+    if len(times) >= LEAST_STAMPS and backwards > MOST_BACKWARDS * len(times):
+        raise TableError(
+            f"{path}: column {time.time} goes backwards in {backwards} of {len(times)} rows: sort them by time"
+        )
+    return np.asarray(times)
 
 
 def _mf4(path: Path, names: Sequence[str] | None) -> dict[str, Samples]:

@@ -7,6 +7,7 @@ It reads only our frames, as any dashboard ECU would, and judges them by the rul
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -41,13 +42,16 @@ ADVICE = {
     ("no_go", "slip"): "Stop, lift the implement",
     ("no_go", "sinkage"): "Stop, turn off soft ground",
     ("no_go", None): "Stop, lift the implement",
+    ("go", "stuck"): "Lift, add no torque",
+    ("caution", "stuck"): "Lift, add no torque",
+    ("no_go", "stuck"): "Stop, lift, add no torque",
+    ("unknown", "stuck"): "Stop, lift, add no torque",
 }
-"""What to do by state and limiting cause, in at most five words."""
-WARNED_ADVICE = "Stop, lift, add no torque"
-MOVING_ADVICE = "Lift, add no torque"
-"""The same while the state still lets the vehicle go on: a stop would contradict it."""
-HELD = "Go slowly, caution is held"
-ABOVE_BEST = "Keep going, slip above best"
+"""What to do by state and limiting cause, in at most five words: a stop only where the state does not say go on."""
+UNLADEN = "Go slowly, add no torque", "Stop, add no torque"
+"""The same without and with a stop, where nothing is pulled and the advice would name draft or implement."""
+HELD = {"caution": "Go slowly, caution is held", "no_go": "Stop, no-go is held"}
+ABOVE_BEST = {"go": "Keep going, slip above best", "caution": "Go slowly, slip above best"}
 GONE_ADVICE = "Rely on your own judgement"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
@@ -140,13 +144,15 @@ class Slip(NamedTuple):
 class Dashboard:
     """Received frames and their last minute, as the dashboard shows them.
 
-    `fault` says why the bus is away; it is empty while it is there. Charts show the last `span` seconds.
+    `fault` says why the bus is away; it is empty while it is there. `is_over` says that the recording has ended.
+    Charts show the last `span` seconds.
     """
 
     known: ReceivedFrames
     vehicle: Vehicle = field(default_factory=Vehicle)
     fault: str = ""
     span: float = 60.0
+    is_over: bool = False
     _samples: deque[tuple[float, dict[str, float]]] = field(default_factory=deque, repr=False)
     _began: float = math.nan
 
@@ -201,21 +207,27 @@ class Dashboard:
             moves = slip is not None and slip < CARRYING_SLIP
             is_stuck = state == "no_go" and known.number("Traversability", "Probability") == 0.0 and not moves
             left = known.number("DemandForecast", "TimeLeft")
-            when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
+            when = "" if left is None or left >= TOP_TIME_LEFT else " now" if round(left) == 0 else f" in {left:.0f} s"
             what = "stuck" if is_stuck else f"getting stuck{when}"
-            todo = MOVING_ADVICE if state in ("go", "caution") else WARNED_ADVICE
-            return Verdict("STUCK", f"{NAMES[state]}: {what}", todo, "warned")
+            return Verdict("STUCK", f"{NAMES[state]}: {what}", self._advice(state, "stuck"), "warned")
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
-        limit = known.value("Traversability", "LimitingCause")
-        todo = ADVICE.get((state, str(limit)), ADVICE[state, None])
-        if state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
-            todo = HELD  # nothing limits it: more windows must say the same
-        worst = self.slip()
-        if state == "go" and worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
-            todo = ABOVE_BEST
+        todo = self._advice(state, str(known.value("Traversability", "LimitingCause")))
+        if state == "go" or (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
+            todo = HELD.get(state, todo)  # nothing limits it: more windows must say the same
+            worst = self.slip()
+            if worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
+                todo = ABOVE_BEST.get(state, todo)
         return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
+
+    def _advice(self, state: str, cause: str) -> str:
+        """Return what to do by state and limiting cause, or `stuck`."""
+        said = ADVICE.get((state, cause)) or ADVICE[state, None]
+        draft = self.known.number("PresentDemand", "Draft")
+        if draft is None or draft > 0.0 or not re.search("draft|lift", said, re.IGNORECASE):
+            return said
+        return UNLADEN[said.startswith("Stop")]
 
     def _because(self) -> Iterator[str]:
         """Probability and limit of a known state."""
@@ -252,7 +264,8 @@ class Dashboard:
             return "the draft is not heard any more" if was_there else "no sensor shows the draft", "Go carefully"
         slip = self.slip().value
         if reason == "standstill" and slip is not None and slip >= CARRYING_SLIP:
-            return "the wheels spin", WARNED_ADVICE  # they make no way, so the service calls it a standstill
+            # they make no way, so the service calls it a standstill
+            return "the wheels spin", self._advice("unknown", "stuck")
         if reason in REASONS:
             return REASONS[reason]
         if known.value("SoilbusStatus", "State") == "estimating":
@@ -295,8 +308,9 @@ class Dashboard:
         return [i for i, is_known in enumerate(has_value) if i < named or is_known]
 
     def max_draft(self) -> float | None:
-        """Return the largest draft [N] here and now, while it may be acted on."""
-        return self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
+        """Return the largest draft [N] here and now, while it may be acted on; 0 where it is stuck without any."""
+        most = self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
+        return None if most is None else max(most, 0.0)
 
     def draft_of(self, draft: float, before: str = "of ", unknown: str = "") -> str:
         """Return the draft [N] and the largest one in one unit; a negative draft brakes."""
@@ -307,12 +321,14 @@ class Dashboard:
         return now + (f" {before}{force(most, unit)}" if most is not None else f" {before}{unknown}" * bool(unknown))
 
     def freshness(self) -> str:
-        """Return the age of the data behind the verdict."""
+        """Return the age of the data behind the verdict, or that the recording has ended."""
+        if self.is_over:
+            return "end of the recording"
         age, since = (self.known.number("Traversability", name) for name in ("Age", "SinceValid"))
-        if age is None:
-            return "no data"
         more = "over " if self.known.is_at_top("Traversability", "SinceValid") else ""
-        return f"data {age:.1f} s old" + ("" if since is None else f", valid {more}{since:.1f} s ago")
+        said = [] if age is None else [f"data {age:.1f} s old"]
+        said += [] if since is None else [f"valid {more}{since:.1f} s ago"]
+        return ", ".join(said) or "no estimate"
 
     def sentences(self) -> list[str]:
         """Return the state, what to do, slip, draft, age, and why the bus is away; each where it is known."""
@@ -330,7 +346,7 @@ class Dashboard:
 
 def percent(share: float) -> str:
     """Return a share or a slip in per cent."""
-    return f"{100.0 * share:.0f} %"
+    return f"{round(100.0 * share)} %"
 
 
 def is_above(share: float, other: float) -> bool:

@@ -76,8 +76,7 @@ class PlayedLog:
     ) -> None:
         self._messages, self._speed, self._clock, self._sleep = iter(messages), speed, clock, sleep
         self._next = next(self._messages, None)
-        self._first = 0.0 if self._next is None else self._next.timestamp
-        self._shift = 0.0
+        self._first = self._due = 0.0 if self._next is None else self._next.timestamp
         self._began = clock()
 
     @property
@@ -86,23 +85,25 @@ class PlayedLog:
         return self._next is None
 
     def now(self) -> float:
-        """Return the time [s] of the recording, without the jumps of its clock."""
-        return self._first + self._speed * (self._clock() - self._began)
+        """Return the time [s] of the recording, without the jumps of its clock.
+
+        It waits for a frame that is not handed out yet, and stands still after the last.
+        """
+        return min(self._first + self._speed * (self._clock() - self._began), self._due)
 
     def receive(self, timeout: float, /) -> can.Message | None:
         """Return the next frame, or None after at most `timeout` [s]."""
         message = self._next
         if message is None:
             return None
-        wait = (message.timestamp - self._shift - self.now()) / self._speed
+        wait = (self._due - self.now()) / self._speed
         if wait > 0.0:
             self._sleep(min(wait, timeout))
             if wait > timeout:
                 return None
         self._next = next(self._messages, None)
         if self._next is not None:  # the recording's clock may be set
-            step = self._next.timestamp - message.timestamp
-            self._shift += step - min(max(step, 0.0), LONGEST_GAP)
+            self._due += min(max(self._next.timestamp - message.timestamp, 0.0), LONGEST_GAP)
         return message
 
 
@@ -202,6 +203,7 @@ def show(
         redraw = clock()
         while not (is_over := done()) or (stays and keys is not no_key):
             if is_over:
+                dashboard.is_over = True
                 time.sleep(REDRAW_PERIOD)
             else:
                 _take(dashboard, source, redraw - clock())
@@ -209,7 +211,7 @@ def show(
             if key == "q":
                 return
             chosen = {"d": "driver", "e": "engineer", "\t": "engineer" if name == "driver" else "driver"}.get(key, name)
-            if chosen != name or (clock() >= redraw and not is_over):
+            if chosen != name or clock() >= redraw:
                 name, redraw = chosen, clock() + REDRAW_PERIOD
                 dashboard.sample()
                 live.update(page(dashboard, name, *console.size), refresh=True)
@@ -218,7 +220,7 @@ def show(
 def _show_lines(
     dashboard: Dashboard, source: Source, console: Console, done: Callable[[], bool], clock: Callable[[], float]
 ) -> None:
-    """A line at once when the state or what to do changes, else at most one a second and only where it differs."""
+    """Print a line at once when the state or the first words of what to do change, else one a second at most."""
     last, said, line_due, redraw = "", None, clock(), clock() + REDRAW_PERIOD
     while not done():
         _take(dashboard, source, redraw - clock())
@@ -227,8 +229,9 @@ def _show_lines(
         redraw = clock() + REDRAW_PERIOD
         dashboard.sample()
         verdict, line = dashboard.verdict(), ". ".join(dashboard.sentences()) + "."
-        if line != last and ((verdict.kind, verdict.todo) != said or clock() >= line_due):
-            last, said, line_due = line, (verdict.kind, verdict.todo), clock() + LINE_PERIOD
+        now_said = verdict.kind, verdict.todo.partition(",")[0]
+        if line != last and (now_said != said or clock() >= line_due):
+            last, said, line_due = line, now_said, clock() + LINE_PERIOD
             console.print(Text(line), soft_wrap=True)
             console.file.flush()
 

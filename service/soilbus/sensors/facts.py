@@ -56,7 +56,7 @@ class Limits:
     """Difference of one wheel's median slip from the median of all."""
     free: float = 0.25
     """Largest median slip, either way, of a wheel that rolls freely: wheels towed through soft soil skid by 0.1 to 0.2
-    (Wong 2008, ch. 4); simulated ones on loam by 0.02."""
+    (Wong 2008, ch. 4); simulated ones on loam by 0.02. None drives: above `idle_slip` its radius is in doubt."""
     transfer: float = 0.75
     """Least share of the load transfer by moments: 0 where a front and a rear cell are swapped, -1 where both are.  The
     field vehicle has 1.2 +- 0.1 (on clay, where the draft hardly changes, 2.3 +- 0.5), a simulated drive 1.00."""
@@ -66,7 +66,8 @@ class Limits:
     """Relative difference [1] of an axle's speeds from yaw rate times track that still is a turn's, not a spin's: of 17
     logs of a rover on snow two were refused without it, for the sign of a yaw rate that is right."""
     excited: float = 0.008
-    """Sd of the draft's changes within 1 s, as a share of the weight, below which the balance cannot be decided."""
+    """Sd of the draft's changes within 1 s, or of an axle's thrust, as a share of the weight, below which the balance
+    or the slip cannot be decided."""
     pull: float = 0.02
     """Median pull, as a share of the weight, from which thrust and pull are compared."""
     less_thrust: float = 0.9
@@ -74,9 +75,9 @@ class Limits:
     most_thrust: float = 0.9
     """Largest median thrust over weight that soil can bear for long."""
     least_slip: float = 0.03
-    """Slip [1] that comes with a thrust of the load, at least; twice as much is a warning. Cars on dry asphalt have as
-    much (Gustafsson 1997, Automatica 33:1087), multibody tractors 0.6 on a road and 0.8 on loam, the field vehicle 1 to
-    3, a speed computed from an axle's wheels 0.000 to 0.027 +- 0.007."""
+    """Slip [1] that comes with a thrust of the load, at least. Cars on dry asphalt have as much (Gustafsson 1997,
+    Automatica 33:1087), multibody tractors 0.25 to 2, the field vehicle 1 to 4, a speed computed from an axle's wheels
+    -0.02 to 0.01 +- 0.01."""
     tilted: float = 0.004
     """Sd of the slope [rad] from which it shows whether an accelerometer feels gravity: four times the sensor's own
     noise (`noise.pitch`)."""

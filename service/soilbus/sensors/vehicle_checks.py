@@ -239,15 +239,16 @@ def _locked(facts: Facts) -> Iterator[Finding]:
 
 
 def _free_wheels(facts: Facts) -> Iterator[Finding]:
-    """Rims of wheels that roll freely against the ground."""
+    """Rims of wheels that roll freely against the ground: they may skid, and never drive."""
+    free = {w.name for w in facts.config.wheel if not w.driven}
     for i, wheel in enumerate(facts.rig.wheels):
         slip = median(facts.slip[:, i])
-        if not next(w for w in facts.config.wheel if w.name == wheel).driven and abs(slip) > LIMITS.free:
+        if wheel in free and not -LIMITS.free <= slip <= LIMITS.idle_slip and np.isfinite(slip):
             yield Finding(
                 f"wheel.{wheel}: rolls freely, but its rim goes {1.0 / (1.0 - slip):.2f} times as fast as the ground:"
                 " radius, or unit of its speed or of the ground speed?",
-                True,
-                (f"speed.{wheel}",),
+                abs(slip) > LIMITS.free,
+                (f"speed.{wheel}",) if abs(slip) > LIMITS.free else (),
             )
 
 
