@@ -84,11 +84,11 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
 
 
 @pytest.mark.parametrize("half", [3, 9])
-@pytest.mark.parametrize(("n", "phase"), [(1, 0.25), (2, 0.0), (2, -0.5)])
-@pytest.mark.parametrize(("ahead", "lag"), [(0.4, 0.0), (-0.4, 0.0), (1.7, 0.0), (-9.0, 0.0), (3.0, 0.3)])
+@pytest.mark.parametrize(("n", "phase"), [(1, 0.25), (2, -0.5)])
+@pytest.mark.parametrize(("ahead", "lag"), [(0.4, 0.0), (-9.0, 0.0), (3.0, 0.3)])
 def test_a_shift_along_a_curve_leaves_the_noise_of_instants_as_large_as_it_is(half, n, phase, ahead, lag):
     """Else a sound channel seems late, as some shift leaves smaller residuals."""
-    noise, middle = np.random.default_rng(6).standard_normal((100_000, 60)), 30.0 + (n - 1) / 2.0
+    noise, middle = np.random.default_rng(6).standard_normal((50_000, 60)), 30.0 + (n - 1) / 2.0
     now = noise_of_instants(noise, half, n, phase, middle)
     off = now - value_and_slope(noise, half, middle + phase)[0]
     value, slope = value_and_slope(noise, half, middle + phase + ahead)
