@@ -298,10 +298,9 @@ def test_an_outage_between_two_beats_ends_go_too(recording):
     assert str(bench.sent("Traversability")[-1]["State"]) == "go"
 
 
-@pytest.mark.parametrize("gone", [13.05, 13.5])
-def test_a_window_that_ends_after_an_outage_but_whose_data_end_before_it_is_no_decision(recording, gone):
+def test_a_window_that_ends_after_an_outage_but_whose_data_end_before_it_is_no_decision(recording):
     """The bus is back in time for the window's end at 14 s, and nothing was heard for 0.7 s."""
-    begin = recording[0].timestamp
+    begin, gone = recording[0].timestamp, 13.3
     bench = Bench([m for m in recording if not begin + gone <= m.timestamp < begin + gone + 0.7])
     bench.run(gone)
     bench.away = True
