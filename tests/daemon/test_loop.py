@@ -244,42 +244,6 @@ def test_silence_ends_go_and_is_no_reason_to_stop(recording):
     assert {str(f["SlipWheel1"]) for f in bench.sent("WheelSlip", since=bench.clock.now - 3.0)} == {"not_available"}
 
 
-def test_a_bus_that_goes_and_comes_back(recording):
-    bench = Bench(recording)
-    bench.run(5.0)
-    bench.away = True
-    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
-    bench.run(3.0)
-    assert not bench.bus.is_open
-    assert bench.wire.closed
-    quiet_since = bench.clock.now - 2.0
-    assert bench.sent("WheelSlip", since=quiet_since) == []
-    bench.away = False
-    came_back = bench.clock.now
-    bench.run(2.0)
-    assert bench.bus.is_open
-    first = bench.sent("Traversability", since=came_back)[0]
-    assert first["at"] - came_back < 2.0
-    assert str(first["State"]) == "unknown"
-
-
-def test_a_full_send_queue_keeps_the_newest_frames_and_counts_the_others(recording):
-    bench = Bench(recording)
-    bench.run(1.0)
-    room = bench.wire.full_until = bench.clock.now + 1.37
-    bench.run(2.0)
-    assert bench.bus.is_open
-    lost = 0
-    for name in bench.service.publisher.schedule:
-        frames = bench.sent(name)
-        lost += sum((b["Counter"] - a["Counter"] - 1) % 16 for a, b in itertools.pairwise(frames))
-    assert bench.bus.counts.dropped == lost > 50
-    for name in ("WheelSlip", "Traversability", "TorqueDemand", "DemandForecast"):
-        first, second = bench.sent(name, since=room)[:2]
-        assert first["at"] < room + 0.02  # at once
-        assert 0.0 < second["at"] - first["at"] < 0.1  # and made less than a cycle ago
-
-
 def test_an_outage_between_two_beats_ends_go_too(recording):
     bench = Bench(recording)
     bench.run(13.5)
