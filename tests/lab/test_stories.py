@@ -12,6 +12,7 @@ from soilbus.decision.traversability import Traversability
 from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.states import ServiceState
 from tests.lab.stories.drives import cheap, real
+from tests.lab.stories.onlooker import CONFIG, Drive, good_moment, good_tracked
 from tests.lab.stories.story import TO_ALL, TO_SOME, Event, begin, drawn, end, played
 
 ENOUGH, HEALED = 30, 5
@@ -109,6 +110,27 @@ def test_go_ends_with_the_age_by_our_own_clock_where_the_stamps_stand():
     drive.run(3.0)
     assert drive.go == before
     assert drive.last["Age"] > 3.0
+    assert drive.faults == []
+
+
+def test_the_time_since_the_last_valid_posterior_grows_until_there_is_one():
+    drive = Drive(good_moment(), good_tracked())
+    drive.run(1.0)
+    assert drive.last["SinceValid"] == "not_available"
+    drive.run(6.5)
+    assert drive.last["SinceValid"] <= drive.last["Age"] < 1.2 + CONFIG.estimator.bin
+    drive.wire.blind = True
+    drive.run(4.0)
+    assert str(drive.last["State"]) == "caution"
+    assert drive.last["Age"] < 1.2
+    assert drive.last["SinceValid"] == pytest.approx(4.5, abs=0.7)
+    assert drive.result.traversability.since_valid == pytest.approx(4.0, abs=1.1)
+    drive.wire.blind = False
+    drive.run(1.2)
+    assert drive.last["SinceValid"] < 1.2
+    drive.step_clock(-5.0)
+    drive.run(0.5)
+    assert drive.last["SinceValid"] == "not_available"
     assert drive.faults == []
 
 
