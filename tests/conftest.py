@@ -40,13 +40,15 @@ def _in_real_time(nodeid: str) -> bool:
 
 
 class _TakingTurns(LoadFileScheduling):
-    """Give the tests of a file to one worker, for they share fixtures, and those in real time all to one.
+    """Give the tests of a file to one worker, for they share fixtures, and those in real time to two.
 
-    There is one vcan0, and a second guest kernel beside the first would spoil what is timed in both.
+    There is one vcan0; what systemd runs in a guest of its own judges no times that a second guest beside it spoils.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return "in real time" if _in_real_time(nodeid) else super()._split_scope(nodeid)
+        if not _in_real_time(nodeid):
+            return super()._split_scope(nodeid)
+        return "systemd" if nodeid.startswith("tests/systemd/") else "vcan0"
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
@@ -85,12 +87,15 @@ def vcan_run() -> Iterator[Run]:
 
     Units are only ever started in the guest.
     """
-    made = _ip("link", "add", "dev", "vcan0", "type", "vcan") and _ip("link", "set", "vcan0", "up")
+    made = False
 
     def run(
         command: Sequence[str | Path], *, rw: Iterable[Path] = (), units: Iterable[Path] = (), timeout: float = 120.0
     ) -> subprocess.CompletedProcess[str]:
-        if not units and (made or Path("/sys/class/net/vcan0").exists()):
+        nonlocal made
+        if not units and not Path("/sys/class/net/vcan0").exists():
+            made = _ip("link", "add", "dev", "vcan0", "type", "vcan") and _ip("link", "set", "vcan0", "up")
+        if not units and Path("/sys/class/net/vcan0").exists():
             return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=timeout)
         try:
             return guest.run(command, rw=rw, units=units, timeout=timeout)

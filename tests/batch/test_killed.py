@@ -1,13 +1,17 @@
-"""A batch of processes that are killed with SIGKILL, and the memory that a long log takes."""
+"""A batch whose processes are killed, none of which another user can reach, and the memory that a long log takes."""
 
 from __future__ import annotations
 
+import glob
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -17,6 +21,25 @@ from soilbus.offline.batch import jobs_of, run_batch
 psutil = pytest.importorskip("psutil")
 pytest.importorskip("distributed")
 SHORT = "estimator.window=4"
+LISTENS = "0A"
+"""State of a listening socket in /proc/net/tcp (include/net/tcp_states.h)."""
+
+
+def listening(processes: set[int]) -> list[str]:
+    """Local addresses at which these processes listen or take datagrams by IP, by proc(5)."""
+    inodes = set()
+    for process in processes:
+        for link in glob.glob(f"/proc/{process}/fd/*"):
+            with suppress(OSError):  # closed by now
+                inodes |= set(re.findall(r"^socket:\[(\d+)\]$", os.readlink(link)))
+    found = []
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        path = Path("/proc/net", table)
+        for line in path.read_text().splitlines()[1:] if path.exists() else []:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if inode in inodes and (state == LISTENS or table.startswith("udp")):
+                found.append(f"{table} {local}")
+    return found
 
 
 def wait_for(what: Callable[[], bool], seconds: float = 60.0) -> None:
@@ -24,6 +47,13 @@ def wait_for(what: Callable[[], bool], seconds: float = 60.0) -> None:
     while not what():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+def test_the_table_of_listening_sockets_is_read_right():
+    before = set(listening({os.getpid()}))  # of tests before this one
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert set(listening({os.getpid()})) - before == {f"tcp 0100007F:{port:04X}"}
 
 
 def test_killed_workers_are_replaced_and_a_killed_batch_goes_on_to_the_same_bytes(
@@ -36,8 +66,15 @@ def test_killed_workers_are_replaced_and_a_killed_batch_goes_on_to_the_same_byte
     out, parts = tmp_path / "out", tmp_path / "out/parts"
     command = ["batch", "--config", tractor, "--set", SHORT, str(logs), "--out", str(out)]
     batch = subprocess.Popen([sys.executable, "-m", "soilbus", *command], stderr=subprocess.PIPE, text=True)
+    seen: list[str] = []
+
+    def has_done(more_than: int) -> bool:
+        family = {batch.pid, *(p.pid for p in psutil.Process(batch.pid).children(recursive=True))}
+        seen.extend(listening(family))
+        return len(list(parts.glob("*.json"))) > more_than
+
     try:
-        wait_for(lambda: len(list(parts.glob("*.json"))) >= 1)
+        wait_for(lambda: has_done(0))
         workers = [
             p for p in psutil.Process(batch.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())
         ]
@@ -45,12 +82,13 @@ def test_killed_workers_are_replaced_and_a_killed_batch_goes_on_to_the_same_byte
         for worker in workers:
             worker.kill()
         n = len(list(parts.glob("*.json")))
-        wait_for(lambda: len(list(parts.glob("*.json"))) > n)
+        wait_for(lambda: has_done(n))
         left = psutil.Process(batch.pid).children(recursive=True)
     finally:
         batch.send_signal(signal.SIGKILL)
     said = batch.communicate(timeout=20)[1]
     assert "Traceback" not in said
+    assert seen == []
     done = len(list(parts.glob("*.json")))
     assert n < done < 8
     wait_for(lambda: not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in left))

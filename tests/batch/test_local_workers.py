@@ -1,19 +1,12 @@
-"""A batch on this machine: no port that another user could reach, and a process that dies costs its own task alone."""
+"""A batch on this machine: a process that dies costs its own task alone, and the results are those of a cluster."""
 
 from __future__ import annotations
 
-import glob
 import os
-import re
 import signal
-import socket
 import stat
-import subprocess
-import sys
 import tempfile
-import time
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -22,59 +15,6 @@ from soilbus.offline.cluster import cluster, done_in_turn
 from soilbus.offline.local_workers import KilledWorker, local_workers
 
 psutil = pytest.importorskip("psutil")
-SHORT = "estimator.window=4"
-LISTENS = "0A"
-"""State of a listening socket in /proc/net/tcp (include/net/tcp_states.h)."""
-
-
-def listening(processes: set[int]) -> list[str]:
-    """Local addresses at which these processes listen or take datagrams by IP, by proc(5)."""
-    inodes = set()
-    for process in processes:
-        for link in glob.glob(f"/proc/{process}/fd/*"):
-            with suppress(OSError):  # closed by now
-                inodes |= set(re.findall(r"^socket:\[(\d+)\]$", os.readlink(link)))
-    found = []
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        path = Path("/proc/net", table)
-        for line in path.read_text().splitlines()[1:] if path.exists() else []:
-            _, local, _, state, *_, inode = line.split()[:10]
-            if inode in inodes and (state == LISTENS or table.startswith("udp")):
-                found.append(f"{table} {local}")
-    return found
-
-
-def test_the_table_of_listening_sockets_is_read_right():
-    before = set(listening({os.getpid()}))  # of tests before this one
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        assert set(listening({os.getpid()})) - before == {f"tcp 0100007F:{port:04X}"}
-
-
-def test_no_process_of_a_batch_listens(moved, tractor, tmp_path):
-    logs = tmp_path / "fleet/red"
-    logs.mkdir(parents=True)
-    for n in range(3):
-        (logs / f"{n}.log").write_text(moved(100.0 * n))
-    command = ["batch", "--config", tractor, "--set", SHORT, str(logs), "--out", str(tmp_path / "out")]
-    seen: set[str] = set()
-    most = looks = 0
-    with subprocess.Popen(
-        [sys.executable, "-m", "soilbus", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as batch:
-        while batch.poll() is None:
-            try:
-                family = {batch.pid, *(p.pid for p in psutil.Process(batch.pid).children(recursive=True))}
-            except psutil.NoSuchProcess:
-                break
-            seen |= set(listening(family))
-            most, looks = max(most, len(family)), looks + 1
-            time.sleep(0.02)
-        said = batch.communicate()[1]
-    assert (batch.returncode, said) == (0, b"")
-    assert most >= 2
-    assert looks >= 50
-    assert seen == set()
 
 
 def squared(n: int) -> int:

@@ -111,16 +111,6 @@ def test_the_configuration_of_the_current_folder_is_taken(client, tractor, logs,
     assert "1 of 1 logs done" in capsys.readouterr().out
 
 
-def test_a_damaged_part_is_made_again(client, config, logs, tmp_path):
-    own = jobs_of(config, "t", [str(logs / "red/morning.log")], lambda _: config)
-    run_batch(client, own, tmp_path)
-    whole = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
-    (part,) = (tmp_path / "parts").glob("*.parquet")
-    part.write_bytes(part.read_bytes()[:-100])
-    assert run_batch(client, own, tmp_path).windows == 5
-    assert {path: path.read_bytes() for path in whole} == whole
-
-
 def test_a_part_that_cannot_be_read_is_one_line(client, config, logs, tmp_path):
     own = jobs_of(config, "t", [str(logs / "red/morning.log")], lambda _: config)
     run_batch(client, own, tmp_path)

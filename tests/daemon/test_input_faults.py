@@ -172,19 +172,15 @@ FAULTS = {
         )
         for m in ("AxleLoads", RADAR)
     },
-    **{f"{m} cut": Fault(le.cut(m), BAD, f"input_stale {names}") for m, names in STREAMS.items()},
+    **{f"{m} cut": Fault(le.cut(m), BAD, f"input_stale {STREAMS[m]}") for m in ("McuFL", "Attitude")},
     "RideHeight deleted": Fault(le.cut("RideHeight"), GOOD, "none", since=FROM_THE_START),
     "RideHeight cut": Fault(le.cut("RideHeight"), GOOD, "none"),
     # the same reading for ever, in frames that go on
     "torque frozen": Fault(le.frozen(TORQUES[0]), BAD, lies("torque.FL")),
-    "all torques frozen": Fault(le.frozen(*TORQUES), BAD, lies(*of_all("torque"))),
     "speed frozen": Fault(le.frozen(SPEEDS[2]), BAD, lies("speed.RL")),
     "all speeds frozen": Fault(le.frozen(*SPEEDS), BAD, lies(*of_all("speed"))),
-    "load frozen": Fault(le.frozen(LOADS[1]), BAD, lies("load.FR")),
     "ground speed frozen": Fault(le.frozen(GROUND), BAD, lies("ground_speed")),
     "draft frozen": Fault(le.frozen(DRAFT), BAD, lies("draft")),
-    "pitch frozen": Fault(le.frozen(PITCH), BAD, lies("pitch")),
-    "acceleration frozen": Fault(le.frozen(ACCELERATION), BAD, lies("acceleration")),
     "sinkage frozen": Fault(le.frozen(SINKS[3]), GOOD, lies("sinkage.RR")),
     "everything frozen": Fault(
         le.frozen(*TORQUES, *SPEEDS, *LOADS, *SINKS, GROUND, DRAFT, PITCH), BAD,
@@ -192,20 +188,12 @@ FAULTS = {
     ),
     # dead at zero
     "torque zero": Fault(le.scaled(0.0, TORQUES[3]), BAD, lies("torque.RR")),
-    "speed zero": Fault(le.scaled(0.0, SPEEDS[0]), BAD, lies("speed.FL")),
-    "all speeds zero": Fault(le.scaled(0.0, *SPEEDS), BAD, lies(*of_all("speed"))),
-    "pitch zero": Fault(le.scaled(0.0, PITCH), BAD, lies("pitch")),
     "load zero": Fault(le.scaled(0.0, LOADS[2]), BAD, lies("load.RL")),
-    "all loads zero": Fault(le.scaled(0.0, *LOADS), BAD, lies(*of_all("load"))),
     "draft zero": Fault(le.scaled(0.0, DRAFT), BAD, lies("draft")),
     "ground speed zero": Fault(le.scaled(0.0, GROUND), frozenset({Status.NOT_EXCITED}), "standstill"),
     # single wild readings, and so many that they are no longer single
     "torque spiked": Fault(le.spiked(100.0, 50, TORQUES[0]), GOOD, "none", "outlier"),
-    "speed spiked": Fault(le.spiked(3.0, 50, SPEEDS[0]), GOOD, "none", "outlier"),
-    "load spiked": Fault(le.spiked(5e3, 50, LOADS[0]), GOOD, "none", "outlier"),
-    "ground speed spiked": Fault(le.spiked(2.0, 50, GROUND), GOOD, "none", "outlier"),
     "draft spiked": Fault(le.spiked(8e3, 50, DRAFT), GOOD, "none", "outlier"),
-    "pitch spiked": Fault(le.spiked(0.3, 50, PITCH), GOOD, "none", "outlier"),
     "load spiked often": Fault(le.spiked(5e3, 5, LOADS[0]), BAD, "model_mismatch", "outlier", length=BORDER),
     # late
     "speeds 50 ms late": Fault(le.delayed(0.05, "WheelSpeeds"), GOOD, "none"),
@@ -213,7 +201,6 @@ FAULTS = {
     "attitude 200 ms late": Fault(le.delayed(0.2, "Attitude"), GOOD, "none"),
     "motor 200 ms late": Fault(le.delayed(0.2, "McuFL"), BAD, lies("motor_speed.FL"), length=BORDER),
     "loads 1 s late": Fault(le.delayed(1.0, "AxleLoads"), BAD, "model_mismatch", length=BORDER),
-    "draft 1 s late": Fault(le.delayed(1.0, "DrawbarPin"), BAD, "model_mismatch", length=BORDER),
     "ground speed 1 s late": Fault(le.delayed(1.0, RADAR), BAD, "input_stale ground_speed"),
     "attitude 1 s late": Fault(le.delayed(1.0, "Attitude"), BAD, "model_mismatch"),
     "speeds stamped 50 ms early": Fault(le.stamped_early(0.05, "WheelSpeeds"), GOOD, "none", "time_backwards"),
@@ -224,8 +211,6 @@ FAULTS = {
     "torque sign": Fault(le.flipped(TORQUES[1]), BAD, lies("torque.FR")),
     "all torques sign": Fault(le.flipped(*TORQUES), BAD, lies(*of_all("torque"))),
     "speed sign": Fault(le.flipped(SPEEDS[0]), BAD, "input_stale speed.FL", "error"),
-    "ground speed sign": Fault(le.flipped(GROUND), BAD, "input_stale ground_speed", "error"),
-    "load sign": Fault(le.flipped(LOADS[0]), BAD, "input_stale load.FL", "error"),
     "sinkage sign": Fault(le.flipped(SINKS[0]), BAD, "model_mismatch", "implausible"),
     "draft sign": Fault(le.flipped(DRAFT), BAD, lies("draft"), since=FROM_THE_START, length=12.2),
     "acceleration sign": Fault(le.flipped(ACCELERATION), GOOD, "none", since=FAULT + 5.0),
@@ -253,8 +238,6 @@ FAULTS = {
     "load zero lost": Fault(le.offset(1500.0, LOADS[0]), BAD, "model_mismatch", length=BORDER),
     # codes that are no values
     "torque not valid": Fault(le.codes(0, "McuFL.State"), BAD, "input_stale torque.FL", "not_valid"),
-    "speed not available": Fault(le.codes(0xFFFF, SPEEDS[0]), BAD, "input_stale speed.FL", "not_available"),
-    "load error": Fault(le.codes(0xFE00, LOADS[0]), BAD, "input_stale load.FL", "error"),
     "ground speed reserved": Fault(le.codes(0xFB80, GROUND), BAD, "input_stale ground_speed", "reserved"),
     "sinkage out of reason": Fault(le.codes(0x7FF0, SINKS[0]), GOOD, "none", "implausible"),
     # stammering senders
@@ -299,7 +282,7 @@ BO_ 1328 DrawbarPin: 8 HITCH
 """
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3.0e38])
+@pytest.mark.parametrize("value", [np.nan, 3.0e38])
 def test_a_float_that_is_no_number_is_refused(value, loam, tmp_path):
     lines = (FIELD_TOML.parent / "field.dbc").read_text().splitlines(keepends=True)
     at = next(i for i, line in enumerate(lines) if "DrawbarPin" in line)
@@ -343,10 +326,8 @@ LIES_ON_CLAY: dict[str, Edit] = {
     "ground speed a third too high": le.scaled(1.33, GROUND),
     "wheel speeds three quarters": le.scaled(0.75, *SPEEDS),
     "loads a tenth too low": le.scaled(0.9, *wheels("WheelLoads.{}")),
-    "sinkages zero": le.scaled(0.0, *SINKS),
     "sinkages a third too low": le.scaled(0.67, *SINKS),
     "torque sign": le.flipped("MotorFL.ShaftTorque"),
-    "wheel speeds frozen": le.frozen(*SPEEDS),
 }
 
 

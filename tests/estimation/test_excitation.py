@@ -53,9 +53,10 @@ def of_drive(soil, sinkage, seed):
     return deviations(fit_window(problem, prior).posterior, soil)
 
 
-@pytest.mark.parametrize("sinkage", [True, False], ids=["sinkage", "no sinkage"])
-@pytest.mark.parametrize("soil", driven_windows.NAMES)
-def test_constant_driving_has_right_intervals(sinkage, soil):
+@pytest.mark.parametrize(
+    ("soil", "sinkage"), [("loam", True), ("loam", False), ("wet_clay", False), ("dry_sand", True)]
+)
+def test_constant_driving_has_right_intervals(soil, sinkage):
     z = np.array([of_drive(soil, sinkage, seed) for seed in range(DRIVES)])
     held = (np.abs(z) < NORMAL_95).sum(axis=0)
     assert (held >= binom.ppf(CHANCE, DRIVES, 0.95)).all(), held / DRIVES

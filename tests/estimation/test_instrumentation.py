@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import tomllib
 from dataclasses import replace
@@ -340,15 +339,10 @@ def test_the_same_slope_loads_the_same_axle_forward_and_in_reverse(tmp_path):
 
 @pytest.mark.parametrize("machine", ["a cell of the rear axle", "no load cells"])
 def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_path):
-    """Another generator: loads that shake by 13 %; mass, centre of gravity, c and K drawn as their priors say.
-
-    SOILBUS_SEEDS=10 pytest -s: rms of the errors in sd, and share in the intervals, of so many times the windows.
-    """
+    """Another generator: loads that shake by 13 %; mass, centre of gravity, c and K drawn as their priors say."""
     off = []
     grounds = (shaking.LOAM, shaking.CLAY, shaking.STUBBLE, shaking.LOAM)
-    many = int(os.environ.get("SOILBUS_SEEDS", "1"))
-    for seed in range(4 * many):
-        ground = grounds[seed % 4]
+    for seed, ground in enumerate(grounds):
         rng = np.random.default_rng([seed, 7])
         of_c, of_K, of_mass, of_cg = rng.standard_normal(4).tolist()
         config = configured(
@@ -364,8 +358,7 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
             tan_phi, pressure = result.posterior.tan_phi(), result.bearing
             off.append((tan_phi.value - np.tan(ground.phi)) / tan_phi.std)
             off.append(np.log(pressure.value / ground.bearing_pressure()) * pressure.value / pressure.std)
-    assert len(off) == 24 * many
-    print(f"{machine}: rms {np.sqrt(np.mean(np.square(off))):.2f} sd, {np.mean(np.abs(off) < 1.96):.3f} of {len(off)}")
+    assert len(off) == 24
     assert np.mean(np.abs(off) < 1.96) >= 0.85  # at 0.95 each, fewer than 21 of 24 happen once in 30
     assert 0.3 < np.sqrt(np.mean(np.square(off))) < 1.4
 

@@ -90,11 +90,11 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
 
 
 @pytest.mark.parametrize("half", [3, 9])
-@pytest.mark.parametrize(("n", "phase", "parts"), [(1, 0.25, 1), (2, 0.0, 1), (2, -0.5, 1), (6, 0.0, 3)])
-@pytest.mark.parametrize("ahead", [0.4, -0.4, 1.7, -9.0, 3.0])
+@pytest.mark.parametrize(("n", "phase", "parts"), [(1, 0.25, 1), (2, -0.5, 1), (6, 0.0, 3)])
+@pytest.mark.parametrize("ahead", [0.4, -9.0, 3.0])
 def test_a_shift_along_a_curve_leaves_the_noise_of_instants_as_large_as_it_is(half, n, phase, parts, ahead):
     """Else a sound channel seems late, as some shift leaves smaller residuals."""
-    noise, middle = np.random.default_rng(6).standard_normal((100_000, 60)), 30.0 + (n - 1) / 2.0
+    noise, middle = np.random.default_rng(6).standard_normal((50_000, 60)), 30.0 + (n - 1) / 2.0
     now = noise_of_instants(noise, half, n, phase, middle, parts)
     off = now - mean_value(noise, half, middle + phase, n, parts)
     kept = kept_noise(half, Instants(n, phase, half, parts), ahead)

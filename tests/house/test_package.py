@@ -106,16 +106,11 @@ def test_the_changelog_has_this_version_and_what_came_since() -> None:
     }  # fmt: skip
 
 
-def test_the_citation_is_one() -> None:
-    text = (REPO / "CITATION.cff").read_text()
-    for line in ("cff-version: 1.2.0", "type: software", "license: Apache-2.0", "authors:", "message: "):
-        assert re.search(f"^{line}", text, re.MULTILINE), line
-
-
 def test_the_citation_parses_and_names_the_paper() -> None:
     yaml = pytest.importorskip("yaml")
     cited = yaml.safe_load((REPO / "CITATION.cff").read_text())
     assert {"cff-version", "message", "title", "authors"} <= cited.keys()  # what the format asks for
+    assert (cited["cff-version"], cited["type"], cited["license"]) == ("1.2.0", "software", "Apache-2.0")
     assert cited["authors"] == [{"name": "the soilbus authors"}]
     assert cited["version"] == soilbus.__version__
     (paper,) = cited["references"]

@@ -65,8 +65,8 @@ _OTHERS_PERIOD = 0.01
 _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
 MAX_PAUSE_SMALL_BUFFER = 0.05
 """Longest time [s] between two looks where the kernel's buffer does not hold seconds of frames."""
-N_STARTS, N_SYSTEM_CALLS = 3, 1000
-"""How often a start and a system call are timed."""
+N_SYSTEM_CALLS = 1000
+"""How often a system call is timed."""
 QUIET_TIME = 1.0
 """Time [s] without a frame after which the channel counts as unused."""
 COUNT_TIME = 2.5
@@ -86,15 +86,6 @@ with can.Bus(interface="socketcan", channel=sys.argv[1]) as bus:
         print(n, flush=True)
 """
 """A loop that receives the whole bus with python-can and does nothing else."""
-
-
-_LIBRARIES = """
-import can, cantools, numpy
-from pydantic import BaseModel
-class Anything(BaseModel):
-    number: float = 0.0
-"""
-"""The libraries that the daemon cannot start without; pydantic loads most of itself for a first model."""
 
 
 class NotMeasured(Exception):
@@ -123,10 +114,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     A window whose result never came counts as late as the run is long.
     """
     _check_quiet(channel)
-    ready, libraries, bare = zip(
-        *((_time_to_ready(channel), _time_of(_LIBRARIES), _time_of("")) for _ in range(N_STARTS)), strict=True
-    )
-    with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as daemon:
+    with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as (daemon, ready):
         ear, traffic = Ear(channel), Traffic(channel, 1.5 * seconds)
         with others(channel):
             ear.start()
@@ -152,11 +140,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
         "bus_processor_ratio": shares,
         "bus_memory_mb": Figure(memory / 1e6, 90.0, "", "most resident memory of the daemon", at_most=True),
         "bus_ready_s": Figure(
-            float(np.median([wall for wall, _ in ready])), 1.5,
-            f"python with its libraries: {np.median(libraries):.2f} s, without: {np.median(bare):.2f} s",
-            f"from start to READY=1, median of {N_STARTS}: " + ", ".join(f"{wall:.2f}" for wall, _ in ready) + " s",
-            at_most=True, digits=2,
-            more=("Processor time to READY=1: " + ", ".join(f"{used:.2f}" for _, used in ready) + " s.",),
+            ready, 1.5, "", "from start to READY=1", at_most=True, digits=2,
         ),
     }  # fmt: skip
 
@@ -190,11 +174,12 @@ def _check_quiet(channel: str) -> None:
 
 
 @contextmanager
-def _daemon(channel: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`soilbus run` on the channel, ready."""
+def _daemon(channel: str, folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], float]]:
+    """`soilbus run` on the channel, ready, and the wall time [s] that it took to be."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
         notify.bind(str(folder / "notify"))
         run = ["run", "--config", str(TRACTOR), "--set", "bus.interface=socketcan", "--set", f"bus.channel={channel}"]
+        begin = time.perf_counter()
         process = subprocess.Popen(
             [sys.executable, "-m", "soilbus", *run], env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify")}
         )
@@ -203,8 +188,9 @@ def _daemon(channel: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
             notify.settimeout(60.0)
             while b"READY=1" not in notify.recv(4096):
                 pass
+            ready = time.perf_counter() - begin
             reader.start()
-            yield process
+            yield process, ready
         except TimeoutError:
             raise NotMeasured(f"{channel}: the daemon does not become ready") from None
         finally:
@@ -219,21 +205,6 @@ def _swallow(notify: socket.socket, process: subprocess.Popen[bytes]) -> None:
     while process.poll() is None:
         if select.select([notify], [], [], 0.5)[0]:
             notify.recv(4096)
-
-
-def _time_to_ready(channel: str) -> tuple[float, float]:
-    """Wall and processor time [s] from start to READY=1."""
-    with TemporaryDirectory() as folder:
-        begin = time.perf_counter()
-        with _daemon(channel, Path(folder)) as process:
-            return time.perf_counter() - begin, _processor(process)
-
-
-def _time_of(program: str) -> float:
-    """Wall time [s] of a program in a new process."""
-    begin = time.perf_counter()
-    subprocess.run([sys.executable, "-c", program], check=True)
-    return time.perf_counter() - begin
 
 
 def _processor(process: subprocess.Popen[bytes]) -> float:

@@ -6,26 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
-from soilbus.arrays import Array
-from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.terra.effects.along import instants
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Active, Surroundings, forces_with
-from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.soils import soil_named
-from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
+from soilbus.terra.wheel import WheelModel, state_on, wheel_forces
 from tests.lab.blind import outside
 from tests.lab.blind.cases import FORMS, KINDS, SOILS, Case, cases
-from tests.lab.blind.form import Form, Setting
+from tests.lab.blind.form import Form
 from tests.lab.blind.rim import rim_forces
-
-RADII, WIDTHS = np.array([0.50, 0.50, 0.62, 0.62]), np.array([0.26, 0.26, 0.38, 0.38])
-WHEELS = ("FL", "FR", "RL", "RR")
 
 
 def titles(forms: tuple[Form, ...]) -> list[str]:
@@ -131,106 +120,3 @@ def test_every_form_leaves_its_mark_and_the_tractor_drives_on(form):
         if name.split(".")[0] in sd
     ]
     assert max(marks) > 0.5
-
-
-# Where the literature has another form: how far the hidden effect is from the nearest of the catalogue.
-
-
-@pytest.fixture(scope="module")
-def standard() -> Drive:
-    scenario = Scenario(120.0, (Patch(0.0, "loam"),), speed=Swing(0.8, 2.0), slip=Swing(0.05, 0.4))
-    return drive(reference_configuration(), scenario, 3)
-
-
-def signature(active: Active, standard: Drive) -> Array:
-    """All that an effect changes on a standard drive, as shares of the load or of the weight."""
-    pick = slice(None, None, 15)
-    around = Surroundings(*(a[pick] if np.ndim(a) == 2 else a for a in standard.surroundings))
-    columns = {name: column[pick] for name, column in standard.columns.items()}
-
-    def wheels(quantity: str) -> Array:
-        return np.stack([columns[f"{quantity}.{wheel}"] for wheel in WHEELS], axis=1)
-
-    soil, load, effect = soil_named("loam"), wheels("load"), active.effect
-    state = WheelState(*np.broadcast_arrays(*state_on(soil, wheels("entry_angle"), wheels("slip"), RADII, WIDTHS)))
-    forces, torque, error = np.zeros((3, *load.shape)), np.zeros_like(load), np.zeros_like(load)
-    if effect.wheel is not None or effect.forces is not None:
-        forces = forces_with([active], state, WheelModel(), around) - wheel_forces(state, WheelModel())
-    if effect.torque is not None:
-        torque = effect.torque(wheels("torque"), around, active.values) - wheels("torque")
-    if (late := effect.late.get("torque")) is not None:
-        torque = read_late(wheels("torque"), instants(around.t), active.values, late) - wheels("torque")
-    if effect.load is not None:
-        error = effect.load(around, active.values)
-    if (late := effect.late.get("load")) is not None:
-        error = read_late(load, instants(around.t), active.values, late) - load
-    along = np.zeros((2, len(load)))
-    if (late := effect.late.get("draft")) is not None:
-        draft = columns["draft"][:, None]
-        along[0] = (read_late(draft, instants(around.t), active.values, late) - draft)[:, 0]
-    if effect.draft is not None:
-        along[0] = effect.draft(columns["draft"], around, active.values)
-    if effect.resistance is not None:
-        along[1] = effect.resistance(around, active.values)
-    of_wheels = [forces[0], forces[1], forces[2] / RADII, torque / RADII, error]
-    return np.concatenate([np.ravel(of_wheels / load), np.ravel(along / load.sum(axis=1))])
-
-
-ENOUGH = 1e-4
-"""Share of the squared miss below which a step ends a search: 1e-8 moves no distance in its third digit."""
-
-
-def nearest(name: str, hidden: Array, standard: Drive) -> float:
-    """What the effect of the catalogue leaves of a hidden signature, as a share of it, at the best parameters."""
-    effect = CATALOGUE[name]
-    count = len(WHEELS) if effect.each_wheel else 1
-    rows = [p for p in effect.parameters for _ in range(count)]
-
-    def miss(x: Array) -> Array:
-        scaled = np.array([p.std for p in rows]) * x
-        values = {
-            p.name: (scaled[i * count : (i + 1) * count] if count > 1 else scaled[i])
-            for i, p in enumerate(effect.parameters)
-        }
-        return (signature(Active(effect, values), standard) - hidden) / np.linalg.norm(hidden)
-
-    low, high = (np.array([getattr(p, end) / p.std for p in rows]) for end in ("low", "high"))
-    starts = [[(p.neutral + 0.3 * p.std) / p.std for p in rows]]
-    for i, parameter in enumerate(rows):
-        starts += [[*starts[0][:i], value / parameter.std, *starts[0][i + 1 :]] for value in parameter.starts]
-    found = [
-        least_squares(miss, np.clip(s, low + 1e-9, high - 1e-9), bounds=(low, high), ftol=ENOUGH).fun for s in starts
-    ]
-    return float(min(np.linalg.norm(fun) for fun in found))
-
-
-LOOSELY = [form for form in FORMS if form.title not in ("soil_drift:ramp", "exponential_shear:range")]
-
-
-@pytest.mark.parametrize("form", LOOSELY, ids=titles(tuple(LOOSELY)))
-def test_another_form_is_another_and_the_same_form_the_same(form, standard):
-    sinkage = float(np.mean(standard.columns["sinkage.RL"]))
-    how = form.hide(form.large, Setting(soil_named("loam"), sinkage, np.random.default_rng(1)))
-    if not how.effects:
-        assert form.other  # it gets into the recording by another way altogether
-        assert not form.far  # nobody knows, so it counts with the near ones
-        return
-    left = nearest(form.effect, signature(how.effects[0], standard), standard)
-    assert left > 0.005 if form.other else left < 0.02, left
-    assert (left > 0.1) == form.far, left
-
-
-HOOKS = ("wheel", "forces", "torque", "load", "draft", "resistance")
-
-
-@pytest.mark.parametrize("form", outside.FORMS, ids=titles(outside.FORMS))
-def test_what_the_catalogue_imitates_is_marked(form, standard):
-    how = form.hide(form.large, Setting(soil_named("loam"), 0.05, np.random.default_rng(1)))
-    hidden = [hook for active in how.effects for hook in HOOKS if getattr(active.effect, hook) is not None]
-    alike = [
-        name
-        for name, effect in CATALOGUE.items()
-        if any(getattr(effect, hook) is not None or hook in effect.late for hook in hidden)
-    ]
-    left = [nearest(name, signature(how.effects[0], standard), standard) for name in alike]
-    assert (min(left, default=1.0) < 0.8) == form.imitable, dict(zip(alike, left, strict=True))

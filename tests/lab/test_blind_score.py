@@ -8,19 +8,15 @@ import numpy as np
 import pytest
 
 from soilbus.simulator.scenario import Patch
-from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import soil_named
+from tests.golden.outputs import the_case
 from tests.lab.blind import command
 from tests.lab.blind import trial as trials
-from tests.lab.blind.cases import Case, cases
+from tests.lab.blind.cases import Case
 from tests.lab.blind.form import Hidden, Setting, by_hooks
 from tests.lab.blind.table import figures, report, targets_are_met
 from tests.lab.blind.trial import FAILED, Trial, tried
 from tests.lab.blind.visible import shown
-
-
-def the_case(start: str) -> Case:
-    return next(case for case in cases(start.partition("/")[0], 1) if case.id.startswith(start))
 
 
 def shorter(case: Case, seconds: float = 20.0) -> Case:
@@ -73,15 +69,6 @@ def test_of_two_effects_the_less_visible_one_counts():
 
 
 # --- what counts ---
-
-
-def test_an_effect_broken_on_purpose_lowers_the_score():
-    """Whole it is named: test_blind_subset.py."""
-    broken = replace(CATALOGUE["torque_lag"], late={})
-    found = tried(the_case("single/torque_lag:averaged/medium/"), tuple((CATALOGUE | {"torque_lag": broken}).values()))
-    assert found.visible > 100.0
-    assert next(figures([found])).text == "visible: named first: 0 of 1 = 0 %  (>= 90 %)"
-    assert not targets_are_met([found])
 
 
 def a_trial(**changes: object) -> Trial:

@@ -12,11 +12,10 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
 from tests.lab.peers import finite_differences, kalman, linear, newton_raphson, ours
-from tests.lab.peers.__main__ import main
 from tests.lab.peers.compare import compared, comparison, ours_is_ahead, verdict
 from tests.lab.peers.roster import OURS, Entry, roster
 from tests.lab.peers.scores import Duel, Score, duel, truth
-from tests.lab.peers.windows import assumed_of, configured_prior, simulated_case
+from tests.lab.peers.windows import simulated_case
 
 NAMES = ("loam", "wet_clay", "dry_sand")
 ALL_BUT_PHI_AND_N = ("k_c", "k_phi", "c", "K")
@@ -147,23 +146,6 @@ def score_of(answers: list, seconds: float) -> Score:
     return Score([LOAM] * len(answers), answers, [seconds] * len(answers))
 
 
-def test_scores_by_hand():
-    score = Score([LOAM] * 4, [*answers_of(1.1, 0.7, -1.0, std=0.1), None], [0.001, 0.002, 0.003, 0.010])
-    assert score.quantities == ["phi"]
-    assert score.failure_rate == 0.5
-    assert score.rms("phi") == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2.0))
-    assert score.median("phi") == pytest.approx(0.2)
-    assert score.milliseconds == pytest.approx(2.5)
-    assert score_of(answers_of(1.1, 0.7, std=0.1), 0.0).coverage("phi") == 0.5
-    assert np.isnan(score_of(answers_of(1.1, 0.7), 0.0).coverage("phi"))
-
-
-def test_each_window_is_scored_by_its_own_soil():
-    sand = SOILS["dry_sand"]
-    both = Score([LOAM, sand], [{"phi": Estimate(s.phi, 0.01 * s.phi)} for s in (LOAM, sand)], [0.0] * 2)
-    assert (both.rms("phi"), both.coverage("phi")) == (0.0, 1.0)
-
-
 def test_a_peer_that_is_closer_is_said_to_be():
     off_by = np.linspace(0.05, 0.10, 12)
     good, bad = score_of(answers_of(*(1.0 + off_by / 2.0)), 0.001), score_of(answers_of(*(1.0 - off_by)), 0.002)
@@ -191,21 +173,3 @@ def test_a_peer_that_is_closer_is_said_to_be():
 )  # fmt: skip
 def test_only_what_windows_confirm_is_decided(peer, mine, closer_in, windows, closer):
     assert Duel(peer, mine, closer_in, windows).closer == closer
-
-
-def test_what_is_told_is_off_by_a_quarter():
-    rng = np.random.default_rng(3)
-    off = np.log([assumed_of(LOAM, rng) for _ in range(4000)]) - np.log(LOAM)
-    assert np.exp(off).std(axis=0) / np.exp(off).mean(axis=0) == pytest.approx(np.full(6, 0.25), rel=0.06)
-    case = simulated_case(LOAM, 8)
-    assert case.known == case.assumed
-    assert case.knowing(("K",)).known == case.assumed._replace(K=LOAM.K)
-    assert case.knowing(("K",)).prior.log_std[PARAMETERS.index("K")] == 0.0
-    assert case.prior.median[PARAMETERS.index("n")] == configured_prior()["n"][0]
-
-
-def test_the_command_says_what_is_wrong_with_its_options(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["--windows", "1"])
-    assert end.value.code == 2
-    assert "at least 2 windows" in capsys.readouterr().err

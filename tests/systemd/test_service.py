@@ -24,6 +24,9 @@ def out(vcan_run, tool, field_recording, tmp_path_factory: pytest.TempPathFactor
     folder = tmp_path_factory.mktemp("service")
     prepare(folder, field_recording("loam.log.gz"), PLAYED)
     (folder / "frames-until-window").write_text(str(50 * UNTIL_WINDOW))
+    page = (REPO / "systemd/README.md").read_text()
+    unit = next(text for text in re.findall(r"```ini\n(.*?)```", page, re.DOTALL) if "watch --json" in text)
+    (folder / "soilbus-mqtt@.service").write_text(unit)
     done = vcan_run(
         ["sh", REPO / "tests/systemd/drive.sh", folder],
         rw=[folder],
@@ -87,6 +90,20 @@ def test_it_broadcasts(out: Path) -> None:
     assert heard.count("SoilbusStatus") >= UNTIL_WINDOW - 1
     assert heard.count("Traversability") >= 10 * (UNTIL_WINDOW - 1)
     assert heard.count("WheelSlip") >= 10 * (UNTIL_WINDOW - 1)
+
+
+@pytest.mark.systemd
+def test_results_reach_the_program_that_sends_them_on_as_a_user_of_its_own(out: Path) -> None:
+    said = (out / "results").read_text()
+    user, options, arguments = re.findall(r"^user: (.*); options: (.*); arguments: (.*)$", said, re.M)[0]
+    assert user not in ("root", "soilbus")
+    assert (options, arguments) == ("-h 192.0.2.10", "-l -q 1 -t farm/tractor7/window")
+    lines = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    windows = {line["window"]: line for line in lines if line["window"] is not None}
+    assert {0, 1, 2} <= windows.keys()
+    assert windows[2]["status"] == "valid"
+    assert set(windows[2]["slip"]) == {"FL", "FR", "RL", "RR"}
+    assert properties(out, "results") == {"NRestarts": "0", "Result": "success"}
 
 
 @pytest.mark.systemd

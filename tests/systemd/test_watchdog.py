@@ -2,13 +2,13 @@
 
 Each refused system call kills the process here (the shipped unit lets it fail), so that
 whatever these runs do is proven to need none of them: start, bus lost and found, windows,
-state written, read, refused and not written for a full disk, defects, stop, bad configuration.
+state written, read, refused and not written for a full disk, stop, bad configuration.
+tests/daemon/test_health.py has the other faults, in a loop with a clock in hand.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -48,35 +48,24 @@ def test_silence_and_a_bus_that_is_down_are_no_reason_to_restart(out: Path) -> N
 
 
 @pytest.mark.systemd
-@pytest.mark.parametrize("fault", ["loop", "sender", "estimator"])
+@pytest.mark.parametrize("fault", ["loop", "estimator"])
 def test_the_watchdog_restarts_what_hangs(out: Path, fault: str) -> None:
     assert _restarts(out)[fault] == 1
-    assert (out / "watchdog.journal").read_text().count("Watchdog timeout") == 3
+    assert (out / "watchdog.journal").read_text().count("Watchdog timeout") == 2
 
 
 @pytest.mark.systemd
 def test_the_status_says_what_hangs(out: Path) -> None:
-    assert (out / "sender").read_text().startswith("fault: internal nothing can be sent")
     text = (out / "estimator").read_text()
     assert text.startswith("fault: overload the estimator hangs")
     assert "deadline misses" in text
 
 
 @pytest.mark.systemd
-def test_defects_are_a_fault_and_no_end(out: Path) -> None:
-    assert _restarts(out)["defect"] == 0
-    assert re.search(r"failed solves: .*internal [1-9]", (out / "defect").read_text())
-    journal = (out / "defect.journal").read_text()
-    assert journal.count("failed: ZeroDivisionError: a defect (sitecustomize.py:") == 3
-    assert "Traceback" not in journal
-
-
-@pytest.mark.systemd
 def test_the_state_outlives_restarts(out: Path) -> None:
     state = json.loads((out / "kept.json").read_text())["state"]
-    assert state["starts"] == 4
-    assert state["totals"]["windows"] > 4
-    assert state["totals"]["failed.internal"] >= 3
+    assert state["starts"] == 3
+    assert state["totals"]["windows"] > 0  # of the last run: what the watchdog kills had no time to write
     assert state["totals"]["bus.sent"] > 100
     assert json.loads((out / "fresh.json").read_text())["state"]["starts"] == 1
 

@@ -85,8 +85,7 @@ class Form:
 
     effect: its name in the catalogue, "" where it is not in there.  small: the size, in
     `unit`, that is barely visible with a sinkage sensor and without; large: as great as it
-    gets.  other: no parameters make the catalogue's formula this one.
-    far: no parameters make the catalogue's formula nine tenths of this one.
+    gets.  far: no parameters make the catalogue's formula nine tenths of this one.
     by_sinkage: nothing but a sinkage sensor shows it.  imitable: an effect outside the
     catalogue, more than a fifth of which one inside does to the same readings.
     """
@@ -98,7 +97,6 @@ class Form:
     small: tuple[float, float]
     large: float
     hide: Callable[[float, Setting], Hidden]
-    other: bool = True
     by_sinkage: bool = False
     imitable: bool = False
     far: bool = False

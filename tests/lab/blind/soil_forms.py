@@ -155,9 +155,9 @@ FORMS = (
     Form("multipass", "stiffness", "Holm 1969, with K and slip: Senatore & Sandu 2011", "1", (0.04, 0.4), 1.5,
          by_hooks(wheel=_compacted)),
     Form("multipass", "density", "Wong 2008, ch. 2, in proportions of his own", "1", (0.0075, 0.02), 0.2,
-         by_hooks(wheel=_denser), other=False),
+         by_hooks(wheel=_denser)),
     Form("multipass", "rut", "reloading: Wong 2008, ch. 2", "sinkages", (0.02, 0.045), 0.6,
-         by_hooks(forces=_in_the_rut), other=False),
+         by_hooks(forces=_in_the_rut)),
     Form("rate_stiffening", "log", "logarithm of the loading rate", "1", (0.012, 0.02), 0.25,
          by_hooks(wheel=_logarithm)),
     Form("rate_stiffening", "penetration", "penetration velocity: Grahn 1991", "1", (0.012, 0.02), 0.25,
@@ -166,5 +166,5 @@ FORMS = (
     Form("hardpan", "graded", "denser with depth", "1", (0.3, 0.33), 2.0, by_hooks(forces=_graded)),
     Form("soil_drift", "ramp", "straight line in each parameter", "1", (0.006, 0.009), 0.6, _ramp),
     Form("soil_drift", "border", "tanh", "1", (0.004, 0.006), 0.6, by_hooks(wheel=_border)),
-    Form("soil_drift", "undulating", "sine", "1", (0.005, 0.007), 0.6, by_hooks(wheel=_undulating), other=False),
+    Form("soil_drift", "undulating", "sine", "1", (0.005, 0.007), 0.6, by_hooks(wheel=_undulating)),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Drives drawn at random and their priors, and the windows that are compared with the bound."""
+"""Drives drawn at random, and their priors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from monte_carlo import ROUGHLY_KNOWN, tasks_of, trials
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
@@ -17,7 +16,7 @@ from soilbus.terra.soils import SOILS
 from soilbus.trials import draws
 from soilbus.trials.draws import first_drive, prior_about
 
-CONFIG = reference_configuration(ROUGHLY_KNOWN)
+CONFIG = reference_configuration()
 
 
 def test_drives_are_drawn_until_the_tractor_gets_on(monkeypatch):
@@ -50,20 +49,3 @@ def test_a_prior_misses_by_as_much_as_it_says():
     phi = PARAMETERS.index("phi")
     steep = [prior_about(prior, soil._replace(phi=1.1), rng).median[phi] for _ in range(200)]
     assert max(steep) < 1.3  # well short of a right angle, where the model ends
-
-
-def test_drives_are_independent_and_the_same_whatever_else_is_asked_for():
-    few, many = tasks_of(CONFIG, "loam", 10.0, 3, 5), tasks_of(CONFIG, "loam", 10.0, 8, 5)
-    assert [t.seed for t in few] == [t.seed for t in many[:3]]
-    others = [tasks_of(CONFIG, s, d, 8, n) for s, d, n in (("loam", 2.0, 5), ("wet_clay", 10.0, 5), ("loam", 10.0, 6))]
-    seeds = [t.seed for tasks in (many, *others) for t in tasks]
-    assert len(set(seeds)) == len(seeds)
-    assert few[0].config.estimator.window == 10.0
-
-
-def test_the_same_window_twice_and_without_sinkage_less_is_known():
-    (task,) = tasks_of(CONFIG, "wet_clay", 2.0, 1, 3)
-    (fitted, without), (again, _) = trials(task), trials(task)
-    assert fitted.error == pytest.approx(again.error, rel=1e-12)
-    assert (fitted.bound < without.bound).all()
-    assert fitted.bound[:6] == pytest.approx(np.minimum(fitted.bound[:6], prior_of(CONFIG).log_std))
