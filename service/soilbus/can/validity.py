@@ -20,19 +20,6 @@ from numpy.typing import NDArray
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn, code_limits
 
-__all__ = [
-    "REASONS",
-    "CodeRule",
-    "Verdicts",
-    "in_si",
-    "judge_codes",
-    "judge_validity",
-    "meaning",
-    "rule_of",
-    "vouches",
-    "vouching_codes",
-]
-
 REASONS = tuple(Reason)
 """A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
 

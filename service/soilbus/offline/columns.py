@@ -21,7 +21,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.can.candump import Frame
-from soilbus.can.columns import mapped_columns, unit_in
+from soilbus.can.columns import mapped_columns
 from soilbus.can.log_formats import check_mf4_blocks, placed_copy
 from soilbus.can.logs import LogError
 from soilbus.config.model import Columns as TimeColumn
@@ -347,8 +347,3 @@ def _mf4(path: Path, names: Sequence[str] | None) -> dict[str, Samples]:
 def _channel(signal: Any, start: float) -> Samples:
     t = np.asarray(signal.timestamps, np.float64) + start
     return Samples(t, np.asarray(signal.samples, np.float64), t, str(signal.unit or ""))
-
-
-__all__ = [
-    "Columns", "SignalTable", "TableError", "read_columns", "read_samples", "signal_table", "time_column", "unit_in",
-]  # fmt: skip

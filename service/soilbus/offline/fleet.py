@@ -44,7 +44,7 @@ def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
     records: list[Record] = []
     for job in jobs:
         try:
-            with local_log(job) as path:
+            with local_log(job.log) as path:
                 read = recordings_of(config, database, [path], longest=LONGEST, partial=True).records
         except (LogError, TooLittle, OSError) as error:
             record["left_out"].append({"log": job.log, "fault": one_line(error, 200)})

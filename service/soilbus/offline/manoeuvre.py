@@ -34,8 +34,6 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.wheel import Soil
 
-__all__ = ["Plan", "record_of_recording", "what_excites", "what_to_drive"]
-
 STEP = 4.0
 """Time [s] of a step: as long as a time block of the diagnosis, several windows' bins at every step."""
 RAMP = 1.0

@@ -27,8 +27,6 @@ from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 
-__all__ = ["sent_beside", "sent_frames"]
-
 
 def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
     """Yield the frames that the service sends while each log is on its bus, stamped with the recording's time [s].

@@ -28,16 +28,6 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.terra.vehicle import GRAVITY, slip_ratio
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, sinkage
 
-__all__ = [
-    "Excitation",
-    "contact_pressure",
-    "draft_is_known",
-    "excitation_of",
-    "lacking",
-    "loaded_depths",
-    "sinkage_range",
-]
-
 LEAST_DRAFT = 0.1
 """Draft [1], over the weight, below which a relative error says little: a machine that can pull nothing is known as
 well as one that can.  A tenth is what wheels resist on soft fields (0.05 to 0.1, Wong 2008, fig. 2.60)."""

@@ -27,24 +27,6 @@ if TYPE_CHECKING:
     from soilbus.decision.capability import Capability
     from soilbus.estimation.posterior import Estimate
 
-__all__ = [
-    "FAST_FRAMES",
-    "HOP_FRAMES",
-    "check_cycle_times",
-    "column_names",
-    "demand_frame",
-    "flat_record",
-    "forecast_frame",
-    "hop_frames",
-    "json_line",
-    "known",
-    "likeliest",
-    "slip_frames",
-    "value_std",
-    "values_std",
-    "window_record",
-]
-
 WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
 

@@ -17,8 +17,6 @@ from rich.style import Style
 from soilbus.config.model import Config
 from soilbus.report.received_frames import IN_A_ROW, ReceivedFrames
 
-__all__ = ["Dashboard", "Vehicle", "Verdict", "force", "percent"]
-
 SAMPLE_PERIOD = 0.1
 """Least time [s] between two samples of the history: the cycle of the fast frames."""
 LONGEST_HOLD = 0.5

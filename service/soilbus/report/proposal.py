@@ -40,8 +40,6 @@ from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts
 from soilbus.words import shown
 
-__all__ = ["Proposal", "proposal"]
-
 BEARING_STD_WITHOUT_CELLS = 0.2
 """`estimator.max_bearing_std` [1] for machines without load cells: their windows know the bearing pressure to 10 to
 20 % (`soilbus check` says how well)."""

@@ -11,8 +11,6 @@ from soilbus.pipeline.outputs import PARAMETER_FRAMES, known
 from soilbus.report.dashboard import Dashboard
 from soilbus.report.received_frames import ReceivedFrames
 
-__all__ = ["gist", "received_record"]
-
 COUNTS = {
     "reopened": "Reopened",
     "overruns": "Overruns",

@@ -38,8 +38,6 @@ from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.received_record import gist, received_record
 from soilbus.words import shown
 
-__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch"]
-
 REDRAW_PERIOD = 0.2
 """Time [s] between two pictures."""
 LINE_PERIOD = 1.0

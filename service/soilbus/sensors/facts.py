@@ -14,8 +14,6 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.sensors.consistency import without
 from soilbus.terra.vehicle import slip_ratio
 
-__all__ = ["LIMITS", "Facts", "Finding", "UndecidableError", "block_means", "regression", "spread", "steps"]
-
 
 @dataclass(frozen=True, slots=True)
 class Limits:

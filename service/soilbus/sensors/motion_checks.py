@@ -24,8 +24,6 @@ from soilbus.sensors.consistency import change, median, moving_sum
 from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, block_means, regression, steps
 from soilbus.terra.vehicle import GRAVITY
 
-__all__ = ["MOTION_CHECKS"]
-
 
 def _wheel_based(facts: Facts) -> Iterator[Finding]:
     """A ground speed against which an axle does not slip while its thrust changes."""

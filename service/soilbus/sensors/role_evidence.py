@@ -26,8 +26,6 @@ from soilbus.can.units import STANDARD_GRAVITY
 from soilbus.sensors.facts import LIMITS
 from soilbus.sensors.recorded import Columns, Frame, longest_part
 
-__all__ = ["Facts", "Recording", "facts_of", "recording_of", "weighed"]
-
 BIN = 0.2
 """Time [s] over which samples are averaged before they are compared: a few frames of each sensor."""
 LEAST_BINS = 50

@@ -23,8 +23,6 @@ from soilbus.sensors.consistency import change, median
 from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, block_means, regression, spread, steps
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 
-__all__ = ["VEHICLE_CHECKS"]
-
 
 def _weight(facts: Facts) -> Iterator[Finding]:
     """Sum of the loads against the mass, and each axle's load against the geometry."""

@@ -22,11 +22,6 @@ from soilbus.terra.rim import Quadrature, fixed_shares
 from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel import EXACT_NODES
 
-__all__ = [
-    "EXACT", "EXACT_EXPONENTIAL", "SIMPSON", "Equations", "Forces", "OperatingPoint", "Solution", "Three",
-    "Unknowns", "WheelEquations", "entry_angle", "moduli_from_two_widths",
-]  # fmt: skip
-
 Three = tuple[float, float, float]
 
 MAX_ITERATIONS = 50
