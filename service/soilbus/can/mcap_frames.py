@@ -66,8 +66,10 @@ def frame_message(channel: str, frame: Frame) -> dict[str, Any]:
 
 def frame_batches(stream: BufferedReader) -> Iterator[Batch]:
     """Yield the frames of an MCAP log in the order of the file; ValueError where it has none."""
-    from mcap.records import Channel, Message, Schema
-
+    try:
+        from mcap.records import Channel, Message, Schema
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("this format needs soilbus[mcap]") from None
     schemas: set[int] = set()
     channels: set[int] = set()
     is_empty = True

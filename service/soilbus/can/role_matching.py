@@ -24,6 +24,7 @@ from cantools.database.can import Database, Message, Signal
 
 from soilbus.can.channels import WHOLE, path_of
 from soilbus.can.j1939 import pgn_of
+from soilbus.can.mapping import DIMENSIONS
 from soilbus.can.units import Unit, unit_of
 
 _LETTERS = {"front": "F", "middle": "M", "rear": "R", **{str(k): str(k) for k in range(1, 5)}}
@@ -108,61 +109,61 @@ _GROUPS: Mapping[int, frozenset[str]] = {
 _ASKED = frozenset({"request", "least", "rated"})
 _HITCH = frozenset({"hitch", "draft", "pull", "link"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
-_ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozenset[str]]] = {
+_ROLES: Mapping[str, tuple[float, Mapping[str, float], frozenset[str]]] = {
     "torque": (
-        ("torque",), 0.6,
+        0.6,
         {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
         _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"},
     ),
-    "torque_limit": (("torque",), 0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
+    "torque_limit": (0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
     "motor_speed": (
-        ("rotation",), 0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
+        0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
         _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"},
     ),
     "speed": (
-        ("rotation", "speed"), 0.1, {"wheel": 0.8, "speed": 0.2},
+        0.1, {"wheel": 0.8, "speed": 0.2},
         _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"},
     ),
     "load": (
-        ("force", "mass"), 0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
+        0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
         _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"},
     ),
-    "sinkage": (("length",), 0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
+    "sinkage": (0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
     "ground_speed": (
-        ("speed",), 0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
+        0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
         _ASKED
         | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"}
         | {"relative"},
     ),
     "draft": (
-        ("force",), 0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
+        0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
         _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"},
     ),
     "pitch": (
-        ("angle",), 0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
+        0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
         _ASKED | {"rate", "roll", "lateral", "steering", "hitch"},
     ),
     "roll": (
-        ("angle",), 0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
+        0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
         _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"},
     ),
     "yaw_rate": (
-        ("rotation",), 0.1, {"yaw": 1.0, "rate": 0.2},
+        0.1, {"yaw": 1.0, "rate": 0.2},
         _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"},
     ),
     "acceleration": (
-        ("acceleration",), 0.1, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
+        0.1, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
         _ASKED | {"lateral", "vertical", "limit"},
     ),
     "steering_angle": (
-        ("angle",), 0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
+        0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
         _ASKED | {"hand", "column", "rate", "limit", "fraction"},
     ),
-    "latitude": (("angle",), 0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
-    "longitude": (("angle",), 0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
-    "differential_lock": (("",), 0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
+    "latitude": (0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
+    "longitude": (0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
+    "differential_lock": (0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
 }  # fmt: skip
-"""Of each role: dimensions of its unit, score of a fitting unit, weights of words, words that speak against it."""
+"""Of each role: score of a fitting unit, weights of words, words that speak against it."""
 FEWEST_BITS = 7
 """Length of the shortest signal that measures anything; shorter ones are codes and flags."""
 COARSEST_POSITION = 2e-5
@@ -307,11 +308,6 @@ def _take_sole(out: Assignment) -> None:
             del out.open[slot]
 
 
-def dimensions_of(role: str) -> tuple[str, ...]:
-    """Return the dimensions that the unit of a role's signal may have."""
-    return _ROLES[role][0]
-
-
 def described(candidate: Candidate) -> str:
     """Return a candidate for a comment: path, unit and what speaks against it."""
     said = [candidate.unit] * bool(candidate.unit) + list(candidate.notes)
@@ -358,7 +354,8 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: M
     if signal.name == WHOLE:
         around = own
     found = []
-    for role, (dimensions, *_) in _ROLES.items():
+    for role in _ROLES:
+        dimensions = DIMENSIONS[role]
         if unit is not None and unit.dimension not in dimensions:
             continue
         if signal.length < FEWEST_BITS and dimensions != ("",):
@@ -407,12 +404,12 @@ def _score(
     unit: Unit | None,
     at_wheel: bool,
 ) -> float:
-    dimensions, base, weights, against = _ROLES[role]
+    base, weights, against = _ROLES[role]
     if at_wheel:
         against = against - _HITCH  # a load pin is in a wheel's hub, too
         around = around | {"wheel"} if role == "speed" else around
     is_bare = not own - {"front", "middle", "rear", "speed"}  # it only says where, or how fast: the message says what
-    score = base if unit is not None or dimensions == ("",) else -_NO_UNIT
+    score = base if unit is not None or DIMENSIONS[role] == ("",) else -_NO_UNIT
     for word, weight in weights.items():
         share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
         score += weight * max(share, IN_COMMENT if word in comment else 0.0)
@@ -470,11 +467,9 @@ PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"
 def _tokens(text: str) -> tuple[str, ...]:
     """Pieces of a name: at underscores, capitals and digits, and whole words run together."""
     pieces = re.findall(PIECE, text)
-    return tuple(part for piece in pieces for part in _parted(_singular(piece.casefold())))
-
-
-def _singular(piece: str) -> str:
-    return piece[:-1] if piece not in _WORDS and piece[:-1] in _WORDS and piece.endswith("s") else piece
+    small = [piece.casefold() for piece in pieces]
+    singular = (p[:-1] if p not in _WORDS and p[:-1] in _WORDS and p.endswith("s") else p for p in small)
+    return tuple(part for piece in singular for part in _parted(piece))
 
 
 def _parted(piece: str) -> tuple[str, ...]:

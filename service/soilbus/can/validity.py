@@ -112,8 +112,9 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
     all_within = not outside.any()
     if not all_within:
         verdict[outside] = _VERDICT[Reason.OUT_OF_RANGE]
-        if rule.bands is not None:
-            _mark_bands(verdict, raw, outside, rule.bands)
+        reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
+        for first, reason in zip(rule.bands or (), reasons, strict=False):
+            verdict[outside & (raw >= first)] = _VERDICT[reason]
     if rule.is_float:
         verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
     for code, reason in rule.special:
@@ -145,12 +146,6 @@ def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArra
     if not inside.all():
         verdict[(verdict == 0) & ~inside] = _VERDICT[Reason.IMPLAUSIBLE]
     return value
-
-
-def _mark_bands(verdict: Verdicts, raw: NDArray[Any], outside: NDArray[np.bool_], bands: tuple[int, int, int]) -> None:
-    reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
-    for first, reason in zip(bands, reasons, strict=True):
-        verdict[outside & (raw >= first)] = _VERDICT[reason]
 
 
 def _has_range(signal: Signal) -> bool:

@@ -18,7 +18,7 @@ from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-from soilbus.can.log_formats import is_csv_of_frames
+from soilbus.can.log_formats import csv_of_frames
 from soilbus.config.model import Config
 from soilbus.files import opened, plain_bytes, read_all
 from soilbus.offline import dataset
@@ -123,7 +123,7 @@ def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
             return [{"log": argument}]
         raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
     if "log" not in header:
-        if tables or not header or is_csv_of_frames(",".join(header)):
+        if tables or not header or csv_of_frames(",".join(header)):
             return [{"log": argument}]
         raise BatchError(f"{argument}: a manifest needs a column log; its columns are {', '.join(header) or 'none'}")
     if not rows:
@@ -153,10 +153,12 @@ def _entry(manifest: str, number: int, row: Mapping[str, Any]) -> dict[str, str]
     folder, is_remote = place.rpartition("/")[0], "://" in manifest
     for name in ("log", "configuration"):
         text = texts.get(name)
-        if not text or "://" in text or (name == "configuration" and _is_machine(Path(manifest).parent / text)):
+        beside = Path(manifest).parent / (text or "")
+        is_machine = name == "configuration" and not beside.suffix and not beside.exists()
+        if not text or "://" in text or is_machine:
             continue
         if not is_remote:
-            texts[name] = str(Path(manifest).parent / text)
+            texts[name] = str(beside)
         elif name == "log":
             texts[name] = text if text.startswith("/") else f"{folder}/{text}" + (f"::{archive}" if archive else "")
         elif not text.startswith("/"):
@@ -170,11 +172,6 @@ def _cell(value: Any) -> str:
     if value is None or value != value:
         return ""
     return str(int(value) if isinstance(value, float) and value.is_integer() else value).strip()
-
-
-def _is_machine(configuration: Path) -> bool:
-    """Whether this can only be the name of a reference machine."""
-    return not configuration.suffix and not configuration.exists()
 
 
 def _csv_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
