@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -206,23 +205,19 @@ class Dashboard:
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
-        limit = known.value("Traversability", "LimitingCause")
+        limit, probability = (
+            known.value("Traversability", "LimitingCause"),
+            known.number("Traversability", "Probability"),
+        )
         todo = ADVICE.get((state, str(limit)), ADVICE[state, None])
-        if state == "caution" and (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
+        if state == "caution" and (probability or 0.0) >= self.vehicle.go:
             todo = HELD  # nothing limits it: more windows must say the same
-        worst = self.slip()
-        if state == "go" and worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
-            todo = ABOVE_BEST
-        return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
-
-    def _because(self) -> Iterator[str]:
-        """Probability and limit of a known state."""
-        limit = self.known.value("Traversability", "LimitingCause")
-        probability = self.known.number("Traversability", "Probability")
-        if limit is not None and limit != "none":
-            yield f"limit: {limit}"
-        if probability is not None:
-            yield f"p = {probability:.2f}"
+        slip, best = self.slip().value, self.slip().best
+        if state == "go" and slip is not None and best is not None and round(100.0 * slip) > round(100.0 * best):
+            todo = ABOVE_BEST  # in whole per cents, as a driver reads them
+        because = [] if limit in (None, "none") else [f"limit: {limit}"]
+        because += [] if probability is None else [f"p = {probability:.2f}"]
+        return Verdict(NAMES[state], ", ".join((NAMES[state], *because)), todo, state)
 
     def _unknown(self) -> tuple[str, str]:
         """Why the state is unknown, and what to do."""
@@ -329,11 +324,6 @@ class Dashboard:
 def percent(share: float) -> str:
     """Return a share or a slip in per cent."""
     return f"{100.0 * share:.0f} %"
-
-
-def is_above(share: float, other: float) -> bool:
-    """Return whether a share is greater than another in whole per cents, as a driver reads them."""
-    return round(100.0 * share) > round(100.0 * other)
 
 
 def force(newtons: float, largest: float | None = None) -> str:

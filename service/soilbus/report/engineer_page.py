@@ -59,7 +59,11 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     """Return the engineer's page: at most `height` lines of at most `width` columns."""
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         return small_page(dashboard, width, height)
-    head = [_head(dashboard, width), fitted(Text("  ".join(_forecast(dashboard.known))), width)]
+    verdict, soil = dashboard.verdict(), "  ".join(_kind(dashboard.known))
+    state = f" {verdict.said}"
+    state = f"{state:<{max(width - len(soil) - 1, len(state) + 2)}}{soil} "[:width].ljust(width)
+    forecast = Text("  ".join(_forecast(dashboard.known)))
+    head = [Text(state, style=verdict.style), fitted(forecast, width)]
     blocks = [block(dashboard) for block in BLOCKS]
     columns = max(width // (COLUMN + GAP), 1)
     room = height - len(head) - 1
@@ -67,7 +71,10 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     if len(body) + LEAST_CHARTS > room:
         body = packed(blocks, columns, width, 0)
     lines = [*head, *body][: height - 1]
-    lines += _charts(dashboard, width, height - len(lines) - 1)
+    each = (width - GAP) // 2
+    charts = [_chart(dashboard, name, each) for name in CHARTS]
+    pairs = [Text(f"{left:<{each + GAP}}{right}") for left, right in zip(charts[::2], charts[1::2], strict=True)]
+    lines += [Text(f"last {dashboard.span:.0f} s", style="bold"), *pairs][: max(height - len(lines) - 1, 0)]
     lines += [Text()] * (height - 1 - len(lines))
     return [*lines, footer(dashboard, width)]
 
@@ -109,13 +116,6 @@ def grid(title: Row, *rows: Row) -> list[Text]:
         line.rstrip()
         lines.append(line)
     return lines
-
-
-def _head(dashboard: Dashboard, width: int) -> Text:
-    """State over the whole width, with the kind of soil."""
-    verdict, soil = dashboard.verdict(), "  ".join(_kind(dashboard.known))
-    said = f" {verdict.said}"
-    return Text(f"{said:<{max(width - len(soil) - 1, len(said) + 2)}}{soil} "[:width].ljust(width), style=verdict.style)
 
 
 def _kind(known: ReceivedFrames) -> Iterator[str]:
@@ -221,15 +221,6 @@ def _service(dashboard: Dashboard) -> list[Text]:
 
 
 BLOCKS: tuple[Callable[[Dashboard], list[Text]], ...] = (_soil, _wheels, _limits, _gap, _advice, _refused, _service)
-
-
-def _charts(dashboard: Dashboard, width: int, height: int) -> list[Text]:
-    """Histories of the last minute side by side in two columns, as many as there is room for."""
-    each = (width - GAP) // 2
-    charts = [_chart(dashboard, name, each) for name in CHARTS]
-    pairs = zip(charts[::2], charts[1::2], strict=True)
-    title = Text(f"last {dashboard.span:.0f} s", style="bold")
-    return [title, *(Text(f"{left:<{each + GAP}}{right}") for left, right in pairs)][: max(height, 0)]
 
 
 def _chart(dashboard: Dashboard, name: str, width: int) -> str:

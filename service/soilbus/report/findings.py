@@ -79,7 +79,16 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "configured": {name: values_std(values) for name, values in diagnosis.base.prior_parameters().items()},
         "model": {name: values_std(values) for name, values in findings.diagnosis.completed.parameters().items()},
         "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
-        "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
+        "learned": [
+            {
+                "channel": description.channel,
+                "wheel": description.wheel,
+                "formula": description.formula,
+                "terms": {term.regressor: term.coefficient for term in description.terms},
+                "explained": description.explained,
+            }
+            for description in diagnosis.residual_terms
+        ],
         "warning": WARNING if diagnosis.residual_terms else None,
         "samples": recordings.samples,
         "rejected": recordings.rejected,
@@ -132,16 +141,6 @@ def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
     }
 
 
-def _residual_terms(description: ResidualTerms) -> dict[str, Any]:
-    return {
-        "channel": description.channel,
-        "wheel": description.wheel,
-        "formula": description.formula,
-        "terms": {term.regressor: term.coefficient for term in description.terms},
-        "explained": description.explained,
-    }
-
-
 def why_ambiguous(addition: Addition) -> str | None:
     """Why the alternatives of an effect stay in the set; None where it has none."""
     if not addition.alternatives:
@@ -164,7 +163,12 @@ def _soil(posterior: Posterior, findings: Findings) -> dict[str, Any]:
 def findings_text(findings: Findings) -> str:
     """All findings for a reader at a terminal."""
     diagnosis = findings.diagnosis
-    lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
+    before, after = diagnosis.gap_before, diagnosis.gap_after
+    lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), ""]
+    lines.append(
+        f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
+        f"noise alone: 1, hardly ever above {after.limit():.2f})"
+    )
     lines += [f"  {line}" for line in place_lines(findings)]
     lines += [*configured_lines(diagnosis), *shown_lines(diagnosis, findings.config)]
     for number, addition in enumerate(diagnosis.additions, 1):
@@ -181,15 +185,6 @@ def findings_text(findings: Findings) -> str:
         lines.append(f"  {WARNING}")
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
     return text_of(lines)
-
-
-def gap_line(findings: Findings) -> str:
-    """The gap before and after, and that of noise alone."""
-    before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
-    return (
-        f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
-        f"noise alone: 1, hardly ever above {after.limit():.2f})"
-    )
 
 
 def place_lines(findings: Findings) -> list[str]:

@@ -168,8 +168,7 @@ class ReceivedFrames:
 
     def is_at_top(self, message: str, signal: str) -> bool:
         """Return whether a number is the greatest that its signal can say."""
-        value = self.number(message, signal)
-        top = None if value is None else self._signals[message][signal].maximum
+        value, top = self.number(message, signal), self._signals[message][signal].maximum
         return value is not None and top is not None and value >= top
 
     def is_valid(self, message: str) -> bool:
