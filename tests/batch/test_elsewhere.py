@@ -87,7 +87,7 @@ def test_logs_by_url_give_what_a_worker_here_finds(client, address, here, url, t
     monkeypatch.chdir(here)
     mine = windows_of(tractor, tmp_path / "mine", client.scheduler.address, ["red/one.log"], str(here / "maker.dbc"))
     logs = ["red/one.log", f"{url}/red/one.log", f"{url}/red/none.log"]
-    there = windows_of(tractor, tmp_path / "there", address, logs, f"{url}/maker.dbc")
+    there = windows_of(tractor, tmp_path / "there", address, logs, str(here / "maker.dbc"))
     (wanted,) = mine.values()
     assert set(there) == {f"{url}/red/one.log"}
     assert len(wanted) == 5
@@ -95,13 +95,6 @@ def test_logs_by_url_give_what_a_worker_here_finds(client, address, here, url, t
         pd.testing.assert_frame_equal(found, wanted)
     faults = set(pd.read_parquet(tmp_path / "there/errors.parquet").fault)
     assert faults == {f"{here}/red/one.log: no such file", f"{url}/red/none.log: no such file"}
-
-
-def test_a_dbc_that_no_server_has_is_one_line(address, url, tractor, tmp_path, capsys):
-    command = ["--set", f'dbc.input=["{url}/none.dbc"]', f"{url}/red/one.log", "--out", str(tmp_path / "out")]
-    assert main(["batch", "--config", tractor, *command, "--scheduler", address]) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert f"dbc.input: {url}/none.dbc: no such file" in said
 
 
 def test_a_manifest_over_http_names_logs_beside_it(address, here, url, tractor, tmp_path):

@@ -148,19 +148,16 @@ def run_batch(
 
 def _all_kept(jobs: Sequence[Job], parts: Path) -> dict[str, Outcome]:
     """What came before, by digest, of logs whose files are still the same; what is there of others is removed."""
+    same = {}
     with ThreadPoolExecutor(STATES_AT_ONCE) as threads:
-        kept = dict(zip((job.digest for job in jobs), threads.map(lambda job: _kept(parts, job), jobs), strict=True))
-    same = {digest: one for digest, one in kept.items() if one is not None}
-    for digest in kept.keys() - same.keys():
-        for path in parts.glob(f"{digest}.*"):
-            path.unlink()
+        for job, state in zip(jobs, threads.map(lambda job: _state_of(job.log), jobs), strict=True):
+            kept = kept_of(parts, job.digest)
+            if kept is not None and kept.is_of(*state):
+                same[job.digest] = kept
+            else:
+                for path in parts.glob(f"{job.digest}.*"):
+                    path.unlink()
     return same
-
-
-def _kept(parts: Path, job: Job) -> Outcome | None:
-    """What came of a log before; None where there is nothing, its part is lost, or its file is another one."""
-    kept = kept_of(parts, job.digest)
-    return kept if kept is not None and kept.is_of(*_state_of(job.log)) else None
 
 
 def _state_of(log: str) -> tuple[int | None, int | None]:
@@ -242,8 +239,19 @@ def _diagnosed(
     retry: bool,
 ) -> list[dict[str, Any]]:
     """Findings of each vehicle; those that are kept are not made again."""
-    kept = [parts / f"{_digest_of(jobs, parts)}.json" for jobs in vehicles]
-    left = {path.stem: v for v, path in enumerate(kept) if not _are_kept(path, retry)}
+
+    def is_kept(path: Path) -> bool:
+        """Whether a vehicle's findings are there; with `retry` those that lack a log are not."""
+        findings = json.loads(read_bounded(path, LIMITS.whole)) if retry and path.exists() else {}
+        return path.exists() and not (findings.get("fault") or findings.get("left_out"))
+
+    kept = []
+    for jobs in vehicles:
+        of = hashlib.sha256()  # of its logs as they were read
+        for job in jobs:
+            of.update(job.digest.encode() + (parts / f"{job.digest}.json").read_bytes())
+        kept.append(parts / f"{of.hexdigest()[:24]}.json")
+    left = {path.stem: v for v, path in enumerate(kept) if not is_kept(path)}
     tasks = ((digest, (vehicles[v],)) for digest, v in left.items())
     for n, (digest, findings) in enumerate(done_in_turn(client, findings_of, tasks), 1):
         if isinstance(findings, BaseException):
@@ -252,19 +260,3 @@ def _diagnosed(
         dataset.put(kept[left[digest]], json.dumps(known(findings), indent=1, allow_nan=False).encode())
         progress(f"{n} of {len(left)} vehicles diagnosed")
     return [json.loads(read_bounded(path, LIMITS.whole)) for path in kept]
-
-
-def _are_kept(path: Path, retry: bool) -> bool:
-    """Whether a vehicle's findings are there; with `retry` those that lack a log are not."""
-    if not path.exists():
-        return False
-    findings = json.loads(read_bounded(path, LIMITS.whole)) if retry else {}
-    return not (findings.get("fault") or findings.get("left_out"))
-
-
-def _digest_of(jobs: Sequence[Job], parts: Path) -> str:
-    """Names the findings of a vehicle: of its logs as they were read."""
-    of = hashlib.sha256()
-    for job in jobs:
-        of.update(job.digest.encode() + (parts / f"{job.digest}.json").read_bytes())
-    return of.hexdigest()[:24]

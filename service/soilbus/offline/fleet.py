@@ -72,15 +72,17 @@ def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
             "scope": scope[name],
             "probability": probability,
             "parameters": values_std(values.get(name, {})),
-            "onset": _onset(found.onsets[name], record["logs"]) if name in found.onsets else None,
+            "onset": _onset(found.onsets.get(name), record["logs"]),
         }
         for name, probability in found.probabilities.items()
     ]
     return record
 
 
-def _onset(onset: Onset, logs: Sequence[str]) -> dict[str, Any]:
+def _onset(onset: Onset | None, logs: Sequence[str]) -> dict[str, Any] | None:
     """The first log with an effect, and the size in each log alone."""
+    if onset is None:
+        return None
     by_log = zip(logs, onset.probabilities, onset.sizes, strict=True)
     return {
         "log": logs[onset.first],

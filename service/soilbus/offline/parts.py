@@ -32,7 +32,7 @@ from cantools.database.can import Database
 from soilbus import __version__
 from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.config.file import located
-from soilbus.config.model import Config, ConfigError
+from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
 from soilbus.export.table import arrow_table, joined, parquet_bytes
@@ -117,32 +117,14 @@ def setup_of(config: Config, name: str) -> Setup:
     digest = hashlib.sha256((config.model_dump_json() + (config.log_channel or "")).encode())
     database = None
     if config.table is None:
-        with TemporaryDirectory(prefix="soilbus-") as folder:
-            here = _with_dbcs_here(config, Path(folder))
-            database = load_databases(here)
-            for dbc in here.dbc.input:
-                digest.update(hashlib.sha256(located(here.folder, dbc).read_bytes()).digest())
-            # a worker has none of these files: what it needs of them is the database, and the names of what is checked
-            config = _with_dbc(config, input=[], checked=sorted(checked_messages(here, database)))
+        database = load_databases(config)
+        for dbc in config.dbc.input:
+            digest.update(hashlib.sha256(located(config.folder, dbc).read_bytes()).digest())
+        # a worker has none of these files: what it needs of them is the database, and the names of what is checked
+        of_dbc = {"input": [], "checked": sorted(checked_messages(config, database))}
+        config = config.model_copy(update={"dbc": config.dbc.model_copy(update=of_dbc)})
         Pipeline(config, database)
     return Setup(name, pickle.dumps((config, database)), digest.hexdigest())
-
-
-def _with_dbc(config: Config, **settings: list[str]) -> Config:
-    return config.model_copy(update={"dbc": config.dbc.model_copy(update=settings)})
-
-
-def _with_dbcs_here(config: Config, folder: Path) -> Config:
-    """The configuration with copies, in the folder, of the DBC files that it names by URL."""
-    paths = []
-    for n, name in enumerate(config.dbc.input):
-        paths.append(name)
-        if "://" in name:
-            try:
-                paths[-1] = str(_fetched(name, folder / str(n)))
-            except LogError as error:
-                raise ConfigError([f"dbc.input: {error}"]) from None
-    return _with_dbc(config, input=paths)
 
 
 def place_of(log: str) -> str:
@@ -159,11 +141,10 @@ def file_name(log: str) -> str:
 
 
 def _fetched(url: str, folder: Path) -> Path:
-    """Copy of the file at a URL, in a folder that is made; LogError where there is none."""
+    """Copy of the file at a URL; LogError where there is none."""
     from fsspec.core import url_to_fs
 
     path = folder / file_name(url)
-    folder.mkdir(exist_ok=True)
     try:
         files, name = url_to_fs(url)
         files.get_file(name, str(path))
@@ -185,7 +166,12 @@ def part_of(job: Job) -> tuple[Outcome, bytes]:
     size, part = 0, b""
     try:
         with local_log(job.log) as path:
-            _check_is_file(path)
+            mode = path.stat().st_mode
+            if stat.S_ISDIR(mode):
+                unread = "" if os.access(path, os.R_OK | os.X_OK) else " that cannot be read"
+                raise LogError(f"{path}: a folder{unread}")
+            if not stat.S_ISREG(mode):  # a pipe or device may have no end
+                raise LogError(f"{path}: not a regular file")
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
             outcome, part = _replayed(job, path, time.thread_time() + CPU_FREE + CPU_PER_BYTE * size)
@@ -199,15 +185,6 @@ def part_of(job: Job) -> tuple[Outcome, bytes]:
     except Exception as error:  # a defect of ours, or of a library on a file that it never met
         outcome = Outcome(f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True)
     return replace(outcome, part_bytes=len(part), size=size), part
-
-
-def _check_is_file(path: Path) -> None:
-    """LogError where it is a folder, or a pipe or device, which may have no end."""
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        raise LogError(f"{path}: a folder" + ("" if os.access(path, os.R_OK | os.X_OK) else " that cannot be read"))
-    if not stat.S_ISREG(mode):
-        raise LogError(f"{path}: not a regular file")
 
 
 @contextmanager

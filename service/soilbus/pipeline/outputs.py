@@ -90,13 +90,13 @@ def json_line(result: WindowResult, config: Config) -> str:
 
 def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
     """Return the result as nested dicts and lists (keys: docs/json.md), in SI units, None where not known."""
-    decision = result.traversability
+    decision, z_ref, driven = result.traversability, config.estimator.z_ref, result.z_driven
     bearing = {
-        "z_ref": config.estimator.z_ref,
+        "z_ref": z_ref,
         "b_ref": config.estimator.b_ref,
         **value_std(result.bearing),
-        "z_driven": None if result.z_driven is None else list(result.z_driven),
-        "extrapolates": _extrapolates(result, config.estimator.z_ref),
+        "z_driven": None if driven is None else list(driven),
+        "extrapolates": None if result.bearing is None or driven is None else not driven[0] <= z_ref <= driven[1],
     }
     posterior = result.posterior
     line = {
@@ -191,14 +191,6 @@ def column_names(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     return sorted(set(names) - wholes, key=lambda name: (keys.index(name.partition(".")[0]), names.index(name)))
 
 
-def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
-    """Whether the depth z_ref [m] of the bearing pressure lies outside the wheels' sinkages; None where not known."""
-    if result.bearing is None or result.z_driven is None:
-        return None
-    low, high = result.z_driven
-    return not low <= z_ref <= high
-
-
 def _capability(capability: Capability) -> dict[str, Any]:
     """The parts of the capability that `traversability` does not hold."""
     forecast = capability.forecast
@@ -286,8 +278,9 @@ def _advice(capability: Capability | None) -> dict[str, float | None]:
     values = {}
     for axle, name in (("front", "Front"), ("rear", "Rear")):
         point = points.get(axle)
-        values[f"SlipForEfficiency{name}"] = None if point is None else _value(point.efficiency)
-        values[f"SlipForPull{name}"] = None if point is None else _value(point.pull)
+        for what in ("Efficiency", "Pull"):
+            slip = None if point is None else getattr(point, what.lower())
+            values[f"SlipFor{what}{name}"] = None if slip is None else slip.value
     return values
 
 
@@ -323,10 +316,6 @@ def known(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [known(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _value(estimate: Estimate | None) -> float | None:
-    return None if estimate is None else estimate.value
 
 
 def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:
