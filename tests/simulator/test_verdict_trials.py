@@ -16,7 +16,7 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import WheelModel, sinkage, state_on
 from soilbus.trials.draft_trials import true_largest_draft
-from soilbus.trials.verdict_trials import Call, Task, reliability, trial, verdict_trials, wilson
+from soilbus.trials.verdict_trials import Call, reliability, trial, verdict_trials, wilson
 
 CONFIG = reference_configuration()
 
@@ -86,11 +86,11 @@ def test_calls_of_drives_come_true_as_often_as_they_say():
     assert abs(found.excess) < 2.5
     assert abs(found.brier - found.brier_expected) < 2.5 * found.brier_std
     assert found.wrong_go == 0  # few go are near the limit
-    assert trial(Task(CONFIG, 3)) == trial(Task(CONFIG, 3))
+    assert trial(CONFIG, 3) == trial(CONFIG, 3)
 
 
 def test_what_the_service_does_not_call_valid_is_never_called_go():
     strict = CONFIG.estimator.model_copy(update={"max_bearing_std": 1e-6})
-    sure, unsure = (trial(Task(c, 5)) for c in (CONFIG, CONFIG.model_copy(update={"estimator": strict})))
+    sure, unsure = (trial(c, 5) for c in (CONFIG, CONFIG.model_copy(update={"estimator": strict})))
     assert (sure.state, unsure.state) == (State.GO, State.CAUTION)
     assert sure.probability == unsure.probability > 0.95
