@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 from soilbus.config.model import J1939
 
+__all__ = ["STANDARD_PGNS", "SourceLock", "group_mask", "name_of", "pgn_of", "source_of"]
+
 GROUND_BASED_SPEED = 65097
 STANDARD_PGNS = frozenset(
     {61444, 61449, 61459, 61481, 61482, 61485}  # engine torque, vehicle dynamics, attitude, rates, acceleration

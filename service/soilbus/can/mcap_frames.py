@@ -17,21 +17,13 @@ import can
 from soilbus.can.candump import Batch, Frame, of_message
 from soilbus.files import LIMITS, within_ratio
 
+_STAMP = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}}}
+_CHANNEL = {"type": "string", "description": "channel of the bus"}
 FRAME_SCHEMA = {
     "title": "can_msgs/Frame",
     "type": "object",
     "properties": {
-        "header": {
-            "type": "object",
-            "properties": {
-                "stamp": {
-                    "type": "object",
-                    "title": "time",
-                    "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}},
-                },
-                "frame_id": {"type": "string", "description": "channel of the bus"},
-            },
-        },
+        "header": {"type": "object", "properties": {"stamp": _STAMP, "frame_id": _CHANNEL}},
         "id": {"type": "integer", "description": "identifier, without flags"},
         "is_rtr": {"type": "boolean"},
         "is_extended": {"type": "boolean"},

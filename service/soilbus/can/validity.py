@@ -20,6 +20,11 @@ from numpy.typing import NDArray
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn, code_limits
 
+__all__ = [
+    "REASONS", "CodeRule", "Verdicts", "in_si", "judge_codes", "judge_validity", "meaning", "rule_of", "vouches",
+    "vouching_codes"
+]  # fmt: skip
+
 REASONS = tuple(Reason)
 """A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
 
@@ -61,8 +66,11 @@ def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
     """
     named = tuple((code, reason) for code, name in (signal.choices or {}).items() if (reason := meaning(str(name))))
     if signal.conversion.is_float:
-        low, high = _float_range(signal)
-        return CodeRule(low, high, True, None, named)
+        low = -math.inf if signal.minimum is None or not _has_range(signal) else float(signal.minimum)
+        high = math.inf if signal.maximum is None or not _has_range(signal) else float(signal.maximum)
+        # a float32 signal may pass a limit by its own rounding
+        eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
+        return CodeRule(low - eps * abs(low), high + eps * abs(high), True, None, named)
     first, last = code_limits(signal)
     least, greatest = _code_range(signal, first, last)
     special: dict[int, Reason] = {}
@@ -152,16 +160,6 @@ def _has_range(signal: Signal) -> bool:
     if signal.minimum is None and signal.maximum is None:
         return False
     return not signal.minimum == signal.maximum == 0
-
-
-def _float_range(signal: Signal) -> tuple[float, float]:
-    """Physical limits; a float32 signal may pass a limit by its own rounding."""
-    if not _has_range(signal):
-        return -math.inf, math.inf
-    low = -math.inf if signal.minimum is None else float(signal.minimum)
-    high = math.inf if signal.maximum is None else float(signal.maximum)
-    eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
-    return low - eps * abs(low), high + eps * abs(high)
 
 
 def _code_range(signal: Signal, first: int, last: int) -> tuple[int, int]:

@@ -23,15 +23,13 @@ from soilbus.config.model import Config
 from soilbus.files import opened, plain_bytes, read_all
 from soilbus.offline import dataset
 from soilbus.offline.cluster import BatchError
-from soilbus.offline.columns import MISSING_CELLS, check_cells, csv_rows
+from soilbus.offline.columns import MISSING_CELLS, PACKED, check_cells, csv_rows
 from soilbus.offline.parts import Job, Setup, file_name, kept_of, place_of, setup_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
 LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
 """Of logs in a folder; what a log is, its content tells."""
-PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zst")
-"""Each may stand behind one of a log."""
 TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
 
@@ -260,4 +258,4 @@ def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
 
 def _is_log(name: str, suffixes: Sequence[str]) -> bool:
     path = Path(name.lower())
-    return (path.with_suffix("") if path.suffix in PACKED_SUFFIXES else path).suffix in suffixes
+    return (path.with_suffix("") if path.suffix in PACKED else path).suffix in suffixes

@@ -384,7 +384,9 @@ class WindowEstimator:
             return Status.INVALID, "no_convergence"
         if fit is None or not fit.converged:
             return Status.INVALID, self._mismatch
-        if tracked.mismatch or self._contradicts(fit):
+        sensors, settings = np.asarray(self._gain_std), self._settings
+        far = np.abs(fit.gains[: len(sensors)]) > settings.max_gain_error * sensors  # from what is configured of them
+        if tracked.mismatch or far.any() or self._predictions.error() > settings.max_prediction_error:
             return Status.DEGRADED, self._mismatch
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
@@ -394,13 +396,6 @@ class WindowEstimator:
         if lacks := lacking(fit, self._driven_rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
-
-    def _contradicts(self, fit: Fit) -> bool:
-        """Whether new data are far from their prediction, or a sensor's gain is far from what is configured of it."""
-        sensors = np.asarray(self._gain_std)
-        gains = np.abs(fit.gains[: len(sensors)])
-        too_far = bool((gains > self._settings.max_gain_error * sensors).any())
-        return too_far or self._predictions.error() > self._settings.max_prediction_error
 
     def _failure(self, tracked: TrackerOutput) -> str | None:
         """Kind of failure of a solve: not_finite or no_convergence; None for none."""

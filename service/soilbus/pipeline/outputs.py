@@ -23,6 +23,12 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.pipeline.states import state_after
 from soilbus.terra.soils import UNKNOWN
 
+__all__ = [
+    "FAST_FRAMES", "HOP_FRAMES", "check_cycle_times", "column_names", "demand_frame", "flat_record",
+    "forecast_frame", "hop_frames", "json_line", "known", "likeliest", "slip_frames", "value_std", "values_std",
+    "window_record"
+]  # fmt: skip
+
 if TYPE_CHECKING:
     from soilbus.decision.capability import Capability
     from soilbus.estimation.posterior import Estimate
@@ -41,20 +47,20 @@ MAX_CLASSES = 3
 """Number of known soils that a window names."""
 
 PARAMETER_FRAMES = {
-    # JSON name: (message, SI value of one unit of the DBC)
-    "k_c": ("SoilCohesiveModulus", 1e3),
-    "k_phi": ("SoilFrictionalModulus", 1e3),
-    "n": ("SoilSinkageExponent", 1.0),
-    "phi": ("SoilFrictionAngle", math.pi / 180.0),
-    "c": ("SoilCohesion", 1e3),
-    "K": ("SoilShearModulus", 1e-3),
+    "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)", 1e3),
+    "k_phi": ("SoilFrictionalModulus", "kN/m^(n+2)", 1e3),
+    "n": ("SoilSinkageExponent", "", 1.0),
+    "phi": ("SoilFrictionAngle", "deg", math.pi / 180.0),
+    "c": ("SoilCohesion", "kPa", 1e3),
+    "K": ("SoilShearModulus", "mm", 1e-3),
 }
+"""Of each parameter by its JSON name: message, unit in the DBC and in reports, and that unit's value in SI."""
 
 REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error", "second_sender": "bad_counter"}
 """Names in the value table for reasons of refusal: the signal itself has no value, or a code that older DBCs have."""
 
 HOP_FRAMES = (
-    "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
+    "SoilStrength", "SoilClass", *(message for message, *_ in PARAMETER_FRAMES.values()), "DraftCapability",
     "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2", "WindowQuality",
 )  # fmt: skip
 """Names of the frames that are sent once per window."""
@@ -241,7 +247,7 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
     )
     yield "SoilClass", common | _soil_class(result.soil_class)
     parameters = {} if result.posterior is None else result.posterior.parameters()
-    for name, (message, unit) in PARAMETER_FRAMES.items():
+    for name, (message, _, unit) in PARAMETER_FRAMES.items():
         yield message, common | _value_and_std("Value", "Std", parameters.get(name), unit)
     yield "DraftCapability", common | _value_and_std("MaxDraft", "MaxDraftStd", decision.max_draft, 1.0)
     yield "GradeCapability", common | _value_and_std("MaxGrade", "MaxGradeStd", decision.max_grade, 1.0)

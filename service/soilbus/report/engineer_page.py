@@ -11,32 +11,18 @@ from collections.abc import Callable, Iterator
 
 from rich.text import Text
 
+from soilbus.pipeline.outputs import PARAMETER_FRAMES
 from soilbus.report.dashboard import Dashboard, percent
 from soilbus.report.driver_page import LEAST_HEIGHT, LEAST_WIDTH, footer, small_page
-from soilbus.report.received_frames import ReceivedFrames
+from soilbus.report.received_frames import BUS_COUNTS, ReceivedFrames
 from soilbus.report.text_charts import sparkline
 
 COLUMN = 38
 """Columns that a block needs at least."""
 GAP = 2
 """Columns between two blocks."""
-PARAMETERS = {
-    "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)"),
-    "k_φ": ("SoilFrictionalModulus", "kN/m^(n+2)"),
-    "n": ("SoilSinkageExponent", ""),
-    "φ": ("SoilFrictionAngle", "°"),
-    "c": ("SoilCohesion", "kPa"),
-    "K": ("SoilShearModulus", "mm"),
-}
 LIMITS = {"on the level": ("DraftCapability", "GradeCapability"), "here": ("TractionLimits", "TractionLimits")}
 """Messages of draft and of slope, by what they hold for."""
-FAULTS_OF_BUS = {
-    "Overruns": "overruns",
-    "Dropped": "dropped",
-    "ForeignFrames": "foreign",
-    "ErrorFrames": "errors",
-    "Reopened": "reopened",
-}
 CHARTS = {
     "slip": "slip, %",
     "draft": "draft, kN",
@@ -137,7 +123,8 @@ def _forecast(known: ReceivedFrames) -> Iterator[str]:
 def _soil(dashboard: Dashboard) -> list[Text]:
     known = dashboard.known
     rows: list[Row] = [("bearing", _pair(known, "SoilStrength", "BearingPressure"), "kPa")]
-    rows += [(name, _pair(known, message, "Value", "Std"), unit) for name, (message, unit) in PARAMETERS.items()]
+    for name, (message, unit, _) in PARAMETER_FRAMES.items():
+        rows.append((name.replace("phi", "φ"), _pair(known, message, "Value", "Std"), unit.replace("deg", "°")))
     return grid(("soil", "value ± std", "unit"), *rows)
 
 
@@ -213,7 +200,7 @@ def _service(dashboard: Dashboard) -> list[Text]:
     shown = "-" if None in version else ".".join(f"{part:.0f}" for part in version)
     shown += "".join(_said(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s"))
     bus = "".join(_said(known, "BusHealth", "BusState", "{}")) or "-"
-    counts = ((what, known.number("BusHealth", signal)) for signal, what in FAULTS_OF_BUS.items())
+    counts = ((key.partition("_")[0], known.number("BusHealth", signal)) for signal, key in BUS_COUNTS.items())
     faults = [f"{what} {count:.0f}" for what, count in counts if count]
     rows: list[Row] = [("state", state or "-"), ("version", shown), ("bus", bus)]
     pairs = [" ".join(faults[i : i + 2]) for i in range(0, len(faults), 2)]

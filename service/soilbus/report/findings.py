@@ -19,9 +19,8 @@ from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.diagnose import Findings
-from soilbus.pipeline.outputs import known, value_std, values_std
+from soilbus.pipeline.outputs import PARAMETER_FRAMES, known, value_std, values_std
 from soilbus.report.next_drive import plan_lines
-from soilbus.report.soil_prior import SHOWN
 from soilbus.report.statement import (
     doubt,
     is_open,
@@ -183,8 +182,12 @@ def findings_text(findings: Findings) -> str:
             for terms in diagnosis.residual_terms
         ]
         lines.append(f"  {WARNING}")
-    lines += ["", *_soil_lines(findings), "", admission_line(findings)]
-    return text_of(lines)
+    recordings = findings.recordings
+    refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
+    short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
+    logs = "one log" if len(recordings.first) == 1 else f"{len(recordings.first)} logs"
+    used = f"{recordings.samples} samples of {logs}; refused samples: {refused}{short}"
+    return text_of([*lines, "", *_soil_lines(findings), "", used])
 
 
 def place_lines(findings: Findings) -> list[str]:
@@ -264,19 +267,9 @@ def _soil_lines(findings: Findings) -> Iterator[str]:
         for posterior in both:
             found = {"bearing pressure, kPa": (posterior.bearing_pressure(settings.z_ref, settings.b_ref), 1e3)}
             for name, estimate in posterior.parameters().items():
-                unit, size = SHOWN[name]
+                _, unit, size = PARAMETER_FRAMES[name]
                 found[f"{name}, {unit}".rstrip(", ")] = estimate, size
             for name, (of, size) in found.items():
                 rows.setdefault(name, []).append(value_text(of.value / size, of.std / size))
         head = (f"soil of {log}" if several else "soil", "before", "after")
         yield from table(head, [(name, *texts) for name, texts in rows.items()]).splitlines()
-
-
-def admission_line(findings: Findings) -> str:
-    """Samples used and refused."""
-    recordings = findings.recordings
-    refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
-    short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
-    n = len(recordings.first)
-    logs = "one log" if n == 1 else f"{n} logs"
-    return f"{recordings.samples} samples of {logs}; refused samples: {refused}{short}"

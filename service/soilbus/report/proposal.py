@@ -278,7 +278,7 @@ def _put_axle(draft: _Draft, axle: str) -> None:
             _put_gear(draft, axle)
         draft.put_open("differential", '"open", "locked" or "limited"')
         if known is not None:
-            draft.put_signal("torque", torque, **_side(torque))
+            draft.put_signal("torque", torque)
         else:
             draft.put_choice("torque", [torque], "")
         _put_limit(draft, torque, "axle")
@@ -302,7 +302,7 @@ def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
     if motor is not None or (torque is not None and not _is_at_wheel(torque)):
         _put_gear(draft, wheel)
     if torque is not None:
-        draft.put_signal("torque", torque, **_side(torque))
+        draft.put_signal("torque", torque)
         _put_limit(draft, torque, "wheel")
     elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
         draft.put_open("driven", "true or false: no torque of it was found")

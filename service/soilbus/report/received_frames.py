@@ -36,6 +36,11 @@ IN_A_ROW = 5
 """Frames in a row, each with the next counter, that go and caution need: in their 0.4 s soilbus itself has spoken."""
 LEAST_CYCLES = 2
 """Cycles that these frames take at least: a faster second sender could send five between two frames of soilbus."""
+BUS_COUNTS = {
+    "Overruns": "overruns", "Dropped": "dropped", "ForeignFrames": "foreign_frames", "ErrorFrames": "error_frames",
+    "Reopened": "reopened",
+}  # fmt: skip
+"""Signals of BusHealth that are counts, and their keys in JSON."""
 STATES = ("unknown", "no_go", "caution", "go")
 """States of Traversability, the least first."""
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+__all__ = ["CONSISTENCY", "RECEPTION", "ConsistencyOptions", "ReceptionOptions"]
+
 
 @dataclass(frozen=True, slots=True)
 class ReceptionOptions:

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
+__all__ = ["UNIT", "Dual", "slope_of", "value_of", "weighed_sum"]
+
 UNIT = 1.0
 """Derivative of a quantity by itself: this very object saves a multiplication."""
 _FLAT = frozenset({np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal})

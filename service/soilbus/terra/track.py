@@ -45,6 +45,11 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.terra.wheel_state import WheelModel, WheelState
 
+__all__ = [
+    "MEAN_SHEAR", "mean_exponential_shear", "mean_rational_shear", "modulated_shear", "track_forces",
+    "track_forces_and_jacobian", "track_forces_and_slopes", "track_load_and_slope",
+]  # fmt: skip
+
 SERIES_BELOW = 0.02
 """u below which g and its derivative are power series: above, rounding costs them less than 1e-13 of their value."""
 SERIES_TERMS = 9

@@ -27,6 +27,8 @@ from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel
 from soilbus.trials.draft_trials import true_largest_draft
 
+__all__ = ["KINDS", "BoggingDrive", "bogging", "largest_draft", "side_shift"]
+
 FIRM_SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51", "loam")
 SLIPPING_SOILS = FIRM_SOILS[:2] + FIRM_SOILS[3:]
 """Soils on which the reference tractor's motors can turn the wheels into slip; on the others a draft stalls them."""

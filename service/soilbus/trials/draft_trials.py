@@ -29,6 +29,8 @@ from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.trials.draws import Each, drawn_soil, first_drive, prior_about, seeds_of, with_prior
 from soilbus.trials.windows import first_window, torque_limits
 
+__all__ = ["SOILS", "DraftFigures", "DraftTrial", "draft_trials", "figures", "trial", "true_largest_draft"]
+
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
 SOIL_LOG_SD = 0.1
 """Standard deviation of the logarithms of a drive's soil parameters about the named soil."""

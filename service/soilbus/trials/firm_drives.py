@@ -25,6 +25,8 @@ from soilbus.trials.boggings import (
     side_shift,
 )
 
+__all__ = ["EASY", "FIRM_KINDS", "HARD", "firm_ground"]
+
 DRIVE_TIME = 300.0
 """Length of a drive [s]."""
 EASY = "firm"

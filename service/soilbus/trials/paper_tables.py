@@ -13,6 +13,11 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.trials.paper import OperatingPoint, Unknowns
 
+__all__ = [
+    "RUNS", "SANDY_LOAM", "SINKAGE", "SLIP", "START_ERRORS", "TRACTOR_2", "TRIALS", "WET_CLAY", "Run", "Trial",
+    "as_print", "errors_in_percent", "from_print"
+]  # fmt: skip
+
 SLIP = 0.2
 """Section 4.2."""
 SINKAGE = 0.05

@@ -15,6 +15,8 @@ from soilbus.terra.effects.sensors import CHANNEL_LAG, DRAFT_GAIN, DRAFT_OFFSET,
 from soilbus.terra.effects.soil import HARDPAN, MULTIPASS, RATE_STIFFENING, SLIP_SINKAGE, SOIL_DRIFT
 from soilbus.terra.effects.vehicle import DRIVETRAIN_LOSS, GRADE, INERTIA, ROLLING_RADIUS
 
+__all__ = ["CATALOGUE"]
+
 CATALOGUE: dict[str, Effect] = {
     effect.name: effect
     for effect in (

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 from soilbus.terra.effects.effect import Effect, Parameter
 
+__all__ = ["LOAD", "RADIUS", "for_wheel"]
+
 LOAD = 5600.0
 """Load [N] of the wheels that the catalogue's priors are for."""
 RADIUS = 0.56

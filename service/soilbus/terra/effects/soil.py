@@ -11,6 +11,8 @@ from soilbus.terra.effects.along import curve_of, share_of_way, through_knots
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 
+__all__ = ["HARDPAN", "MULTIPASS", "RATE_STIFFENING", "SLIP_SINKAGE", "SOIL_DRIFT"]
+
 REFERENCE_SPEED = 1.0
 """Ground speed [m/s] for which the soil's own K_L holds."""
 TYPICAL_DEPTH = 0.05
