@@ -362,7 +362,7 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: M
             continue
         at_wheel = place in WHEELS
         score = _score(role, own, around, _words(comment), unit, at_wheel) + _by_range(role, signal, unit, own)
-        slot = Slot(role, _place_of(role, place))
+        slot = Slot(role, place if role in WHEEL_AND_AXLE or (role in WHEEL_ONLY and at_wheel) else "")
         notes: tuple[str, ...] = ("no unit: SI assumed",) if unit is None and dimensions != ("",) else ()
         if role in WHEEL_ONLY and slot.place not in WHEELS:
             notes += ("not of one wheel",)
@@ -426,21 +426,16 @@ def _score(
 
 def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str]) -> float:
     """What the range of the DBC, in SI, adds to a score."""
-    low, high = (
-        math.nan if limit is None else float(limit) * (unit.factor if unit else 1.0)
-        for limit in (signal.minimum, signal.maximum)
-    )
+    factor = unit.factor if unit else 1.0
+    low, high = (math.nan if end is None else float(end) * factor for end in (signal.minimum, signal.maximum))
     extent = max(abs(low), abs(high)) if math.isfinite(low) and math.isfinite(high) else math.nan
     if role == "steering_angle":
         # the hand wheel turns further, and is what "steering angle" means on a car
         return -1.0 if extent > 1.6 or {"steering", "wheel"} <= own else 0.0 if extent > 0.0 else -0.3
     if role in ("latitude", "longitude"):
         least = (math.pi / 2.0 if role == "latitude" else math.pi) - 1e-6
-        coarse = not signal.conversion.is_float
-        is_part = (
-            coarse and float(signal.scale) * (unit.factor if unit else 1.0) > COARSEST_POSITION
-        )  # minutes stand elsewhere
-        return -1.0 if extent < least or low >= 0.0 or is_part else 0.0
+        is_coarse = not signal.conversion.is_float and float(signal.scale) * factor > COARSEST_POSITION
+        return -1.0 if extent < least or low >= 0.0 or is_coarse else 0.0  # its minutes stand elsewhere
     if role in ("pitch", "roll"):
         return -1.0 if extent > 2.0 * math.pi - 0.1 or low >= 0.0 else 0.0  # a course
     if role in ("torque", "draft", "acceleration", "yaw_rate") and low >= 0.0:
@@ -448,12 +443,6 @@ def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str])
     if role == "torque_limit" and low < 0.0 and high <= 0.0:
         return -2.0  # of the generator
     return 0.0
-
-
-def _place_of(role: str, place: str) -> str:
-    if role in WHEEL_ONLY:
-        return place if place in WHEELS else ""
-    return place if role in WHEEL_AND_AXLE else ""
 
 
 # --- words ---

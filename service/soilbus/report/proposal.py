@@ -123,7 +123,7 @@ class _Draft:
         back = self.facts.backward.get(c.path)
         said = _said_backward(message, c)
         value = tomlkit.inline_table()
-        value.update({"signal": c.path, **more})
+        value.update({"signal": c.path, **more} | ({"at": "wheel"} if key == "torque" and _is_at_wheel(c) else {}))
         if valid is not None:
             value["valid"] = valid.name
             if valid.choices:
@@ -356,10 +356,6 @@ def _beside(draft: _Draft, torque: Candidate, c: Candidate | None) -> Candidate 
 
 def _is_at_wheel(torque: Candidate) -> bool:
     return is_word_in(torque, "wheel") and not is_word_in(torque, "motor", "shaft")
-
-
-def _side(torque: Candidate) -> dict[str, str]:
-    return {"at": "wheel"} if _is_at_wheel(torque) else {}
 
 
 def _put_signals(draft: _Draft) -> None:

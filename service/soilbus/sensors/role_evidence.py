@@ -145,7 +145,7 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
     moving = np.abs(ground) > MOVING
     if moving.sum() < LEAST_BINS:
         moving = np.ones(len(ground), bool)
-    forward = _one(np.sign(ground))
+    forward = np.where(np.isfinite(ground), np.sign(ground), 1.0)
     axles = axles_of(assignment)
     wheels = [wheel for pair in axles.values() for wheel in pair]
     speed = {w: read("speed", w) for w in wheels}
@@ -259,11 +259,6 @@ def _scatter(one: Array, other: Array) -> float:
 def _keep(into: dict[str, float], place: str, values: Array) -> None:
     if math.isfinite(value := median(values)):
         into[place] = value
-
-
-def _one(values: Array) -> Array:
-    """Values, 1 where they are not known."""
-    return np.where(np.isfinite(values), values, 1.0)
 
 
 def _smooth(values: Array, width: int) -> Array:
