@@ -108,7 +108,7 @@ MUTATIONS = (
     ),
     Mutation(
         "any bit of a new soil is enough", "pipeline/estimator.py",
-        "return tracked.since > end - self.config.traversability.min_share * self._settings.window", "return False",
+        " or tracked.since > task.end - enough", "",
         (f"{DECISION}::test_a_little_of_a_new_soil_is_no_go",),
     ),
     Mutation(

@@ -13,8 +13,9 @@ import soilbus
 from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.model import ConfigError
-from soilbus.offline.batch import BatchError, jobs_of, run_batch
-from soilbus.offline.parts import Outcome
+from soilbus.offline.batch import run_batch
+from soilbus.offline.cluster import BatchError
+from soilbus.offline.jobs import jobs_of
 from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
 from soilbus.pipeline.pipeline import Pipeline
@@ -215,7 +216,7 @@ class KilledWorker(Exception):
     """By the name of Dask's."""
 
 
-def die(job: object, *_: object) -> Outcome:
+def die(job: object, *_: object) -> None:
     raise KilledWorker(job)
 
 

@@ -1,4 +1,4 @@
-"""Workers that are processes of their own and see none of the batch's files: logs and DBC come to them."""
+"""Workers that are processes of their own and see none of the batch's files: DBCs come to them, logs by URL."""
 
 from __future__ import annotations
 
@@ -83,39 +83,18 @@ def windows_of(tractor: str, out: Path, address: str, logs: list[str], dbc: str)
     return {log: rows.drop(columns="log").reset_index(drop=True) for log, rows in windows.groupby("log")}
 
 
-def test_logs_sent_along_and_by_url_give_what_a_worker_here_finds(
-    client, address, here, url, tractor, tmp_path, monkeypatch
-):
+def test_logs_by_url_give_what_a_worker_here_finds(client, address, here, url, tractor, tmp_path, monkeypatch):
     monkeypatch.chdir(here)
     mine = windows_of(tractor, tmp_path / "mine", client.scheduler.address, ["red/one.log"], str(here / "maker.dbc"))
     logs = ["red/one.log", f"{url}/red/one.log", f"{url}/red/none.log"]
-    there = windows_of(tractor, tmp_path / "there", address, logs, f"{url}/maker.dbc")
+    there = windows_of(tractor, tmp_path / "there", address, logs, str(here / "maker.dbc"))
     (wanted,) = mine.values()
-    assert set(there) == {str(here / "red/one.log"), f"{url}/red/one.log"}
+    assert set(there) == {f"{url}/red/one.log"}
     assert len(wanted) == 5
     for found in there.values():
         pd.testing.assert_frame_equal(found, wanted)
-    assert list(pd.read_parquet(tmp_path / "there/errors.parquet").fault) == [f"{url}/red/none.log: no such file"]
-
-
-def test_a_log_that_is_too_large_to_be_sent_along_is_one_line(address, here, tractor, tmp_path):
-    large = here / "red/large.log"
-    large.touch()
-    os.truncate(large, 257 * 2**20)  # sparse
-    try:
-        assert main(["batch", "--config", tractor, str(large), "--out", str(tmp_path), "--scheduler", address]) == 1
-    finally:
-        large.unlink()
-    (fault,) = pd.read_parquet(tmp_path / "errors.parquet").fault
-    assert fault.startswith(f"{large}: workers do not see this path, and with 257 MiB it is too large")
-    assert "(at most 256 MiB): put it where they see the same path, or name it by a URL" in fault
-
-
-def test_a_dbc_that_no_server_has_is_one_line(address, url, tractor, tmp_path, capsys):
-    command = ["--set", f'dbc.input=["{url}/none.dbc"]', f"{url}/red/one.log", "--out", str(tmp_path / "out")]
-    assert main(["batch", "--config", tractor, *command, "--scheduler", address]) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert f"dbc.input: {url}/none.dbc: no such file" in said
+    faults = set(pd.read_parquet(tmp_path / "there/errors.parquet").fault)
+    assert faults == {f"{here}/red/one.log: no such file", f"{url}/red/none.log: no such file"}
 
 
 def test_a_manifest_over_http_names_logs_beside_it(address, here, url, tractor, tmp_path):

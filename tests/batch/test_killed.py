@@ -16,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.offline.batch import jobs_of, run_batch
+from soilbus.offline.batch import run_batch
+from soilbus.offline.jobs import jobs_of
 
 psutil = pytest.importorskip("psutil")
 pytest.importorskip("distributed")
@@ -108,8 +109,8 @@ from soilbus.config.file import load_config
 from soilbus.offline.parts import Job, part_of, setup_of
 setup = setup_of(load_config(sys.argv[1], ["estimator.window=30", "estimator.hop=30"]), "tractor")
 for log in sys.argv[2:]:
-    outcome = part_of(Job(log, "red", setup))
-    assert outcome.fault is None and outcome.part, outcome.fault
+    outcome, part = part_of(Job(log, "red", setup))
+    assert outcome.fault is None and part, outcome.fault
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 """
 

@@ -10,8 +10,9 @@ from contextlib import suppress
 
 import pytest
 
-from soilbus.offline.batch import jobs_of, run_batch
+from soilbus.offline.batch import run_batch
 from soilbus.offline.cluster import cluster, done_in_turn
+from soilbus.offline.jobs import jobs_of
 from soilbus.offline.local_workers import KilledWorker, local_workers
 
 psutil = pytest.importorskip("psutil")

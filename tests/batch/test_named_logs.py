@@ -11,7 +11,9 @@ import pytest
 
 import soilbus
 from soilbus.config.file import load_config
-from soilbus.offline.batch import BatchError, jobs_of, run_batch
+from soilbus.offline.batch import run_batch
+from soilbus.offline.cluster import BatchError
+from soilbus.offline.jobs import jobs_of
 
 pd = pytest.importorskip("pandas")
 pytest.importorskip("distributed")

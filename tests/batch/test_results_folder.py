@@ -8,7 +8,9 @@ import shutil
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.offline.batch import BatchError, cluster, jobs_of, results_in, run_batch
+from soilbus.offline.batch import results_in, run_batch
+from soilbus.offline.cluster import BatchError, cluster
+from soilbus.offline.jobs import jobs_of
 from soilbus.offline.parts import Job, part_of, setup_of
 
 pytest.importorskip("distributed")
@@ -63,7 +65,7 @@ def test_dask_prints_nothing_of_a_lost_scheduler(client):
 def test_a_format_that_a_worker_lacks_is_no_fault_of_the_log(config, tmp_path, monkeypatch):
     (tmp_path / "a.mf4").write_bytes(b"MDF     4.10")
     monkeypatch.setattr("can.io.mf4.asammdf", None)
-    outcome = part_of(Job(str(tmp_path / "a.mf4"), "T7", setup_of(config, "t")))
+    outcome, _ = part_of(Job(str(tmp_path / "a.mf4"), "T7", setup_of(config, "t")))
     assert (outcome.fault, outcome.lasting) == (f"{tmp_path}/a.mf4: this format needs soilbus[mf4]", False)
 
 
@@ -71,10 +73,10 @@ def test_a_log_that_takes_more_processor_time_than_its_size_allows_is_given_up(c
     log = tmp_path / "a.log"
     log.write_text(moved(0.0))
     job = Job(str(log), "T7", setup_of(config, "t"))
-    assert part_of(job).fault is None
+    assert part_of(job)[0].fault is None
     monkeypatch.setattr("soilbus.offline.parts.CPU_FREE", 0.0)
     monkeypatch.setattr("soilbus.offline.parts.CPU_PER_BYTE", 0.0)
-    outcome = part_of(job)
+    outcome, _ = part_of(job)
     assert outcome.fault == f"{log}: given up: it takes more processor time than a log of its size may"
     assert outcome.lasting
 

@@ -142,7 +142,7 @@ TIMES = 0.02 * np.arange(N)
 
 def found(value: np.ndarray, t: np.ndarray = TIMES) -> np.ndarray:
     samples = Samples(np.zeros(len(t), np.int16), t, np.asarray(value, float), np.zeros(len(t), bool))
-    return np.flatnonzero(outlier_test(samples, lambda count, size, level: np.ones(len(size))).outlier)
+    return np.flatnonzero(outlier_test(samples, lambda count, size, level: np.ones(len(size)))[1])
 
 
 def noise(seed: int) -> np.ndarray:
@@ -233,11 +233,11 @@ def test_channels_do_not_mix():
     value[[3, 7, 46, 47, 346]] += 20.0  # in the first channel, and at the ends of the others
     mixed = np.random.default_rng(6).permutation(347)
     samples = Samples(column[mixed], t[mixed], value[mixed], np.zeros(347, bool))
-    judged = outlier_test(samples, lambda count, size, level: np.ones(len(size)))
-    assert np.sort(judged.samples.value[judged.outlier]) == pytest.approx(np.sort(value[[7, 46, 47, 346]]))
+    ordered, outlier, later = outlier_test(samples, lambda count, size, level: np.ones(len(size)))
+    assert np.sort(ordered.value[outlier]) == pytest.approx(np.sort(value[[7, 46, 47, 346]]))
     last = [6, 46, 346]
-    assert judged.later[last].tolist() == [0, 0, 0]
-    assert judged.later[[0, 7, 47]].tolist() == [6, 39, 299]
+    assert later[last].tolist() == [0, 0, 0]
+    assert later[[0, 7, 47]].tolist() == [6, 39, 299]
 
 
 # --- the store: windows do not depend on how the samples came ---

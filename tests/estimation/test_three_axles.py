@@ -17,7 +17,7 @@ from soilbus.estimation.assembly import motors_of, rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import NoiseTable, forward, made_window, pairs, turning
 from soilbus.terra.soils import SOILS
-from soilbus.trials.draft_trials import Task, trial
+from soilbus.trials.draft_trials import trial
 from statics import MODEL, wheel
 
 WEIGHT = 3600.0 * 9.80665
@@ -35,7 +35,7 @@ def of_springs(draft: float) -> np.ndarray:
 @pytest.mark.parametrize("cells", [True, False])
 def test_the_largest_draft_of_six_wheels_on_loam_is_within_its_interval(cells):
     config = six_wheels(cells)
-    found = [trial(Task(config, "loam", seed)) for seed in range(8)]
+    found = [trial(config, "loam", seed) for seed in range(8)]
     off = np.array([(each.predicted - each.true) / each.std for each in found])
     assert np.isfinite(off).all()
     assert (np.abs(off) < 1.96).sum() >= 7  # of eight 95 % intervals: one miss or none in 94 of 100 cases

@@ -69,7 +69,7 @@ def hop_trace(warm_hops: int = WARM_HOPS, watched: bool = False) -> HopTrace:
                 return traced(solve, task)
             solve(task)
             solved += 1
-        due = min(pipeline.next_end, message.timestamp + settings.hop)
+        due = min(pipeline.intake.next_end, message.timestamp + settings.hop)
     raise RuntimeError(f"the drive of {duration:g} s holds {solved} windows, not {warm_hops + 1}")
 
 

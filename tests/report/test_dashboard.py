@@ -120,7 +120,7 @@ SAID = {
     "SoilClass": (r"soil: sandy_loam_15  \(0\.93\)",),
     "PresentDemand": (r"now +3120 +2\.0",),
     "WindowQuality": (r"torque +1\.05", r"draft +2\.35", r"sinkage +0\.95", r"in window +17, most bad_checksum"),
-    "BusHealth": (r"bus +error_passive", r"overruns 7 dropped 3", r"errors 21 reopened 2"),
+    "BusHealth": (r"bus +error_passive", r"overruns 7 dropped 3", r"error 21 reopened 2"),
 }  # fmt: skip
 
 

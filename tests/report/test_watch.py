@@ -16,6 +16,7 @@ import sys
 import termios
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -23,12 +24,14 @@ from rich.console import Console
 
 from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
-from soilbus.can.dbc_files import output_database
+from soilbus.can.candump import frame_of
+from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.can.log_writer import write_log
 from soilbus.can.publish import Publisher
+from soilbus.offline.played_bus import PlayedBus, PlayedClock
 from soilbus.report.dashboard import Dashboard
 from soilbus.report.received_frames import ReceivedFrames
-from soilbus.report.watch import PlayedLog, show
+from soilbus.report.watch import show
 from soilbus.simulator.reference import reference_configuration
 
 DATABASE = output_database(reference_configuration())
@@ -57,7 +60,12 @@ def sent(seconds: float, state="go", publisher: Publisher | None = None) -> list
     return found
 
 
-def lines_of(source, clock, done, now=None, plain=False, **console) -> list[tuple[float, str]]:
+def played(messages: list[can.Message], clock: PlayedClock) -> PlayedBus:
+    """The recording of these messages, played by a clock."""
+    return PlayedBus(map(frame_of, messages), filters_of(DATABASE), clock)
+
+
+def lines_of(source, clock, done, plain=False, **console) -> list[tuple[float, str]]:
     """What `show` prints where there is no terminal, or none to draw on, with the time of each line."""
 
     class Paper(io.StringIO):
@@ -67,21 +75,22 @@ def lines_of(source, clock, done, now=None, plain=False, **console) -> list[tupl
 
     said: list[tuple[float, str]] = []
     begin = clock.now
-    dashboard = Dashboard(ReceivedFrames(DATABASE, now or clock))
+    dashboard = Dashboard(ReceivedFrames(DATABASE, clock))
     show(dashboard, source, Console(file=Paper(), width=40, **console), plain, done, clock)
     return said
 
 
-def test_a_recording_is_played_in_its_own_time_or_faster():
+def test_a_recording_is_played_in_its_own_time_or_faster(monkeypatch):
     for speed in (1.0, 4.0):
-        clock = FakeClock()
-        messages, begin = sent(3.0), clock.now
-        log = PlayedLog(messages, speed, clock, clock.sleep)
+        real = FakeClock()
+        monkeypatch.setattr("soilbus.offline.played_bus.time", SimpleNamespace(monotonic=real, sleep=real.sleep))
+        messages, begin = sent(3.0), real.now
+        log = played(messages, PlayedClock(speed))
         taken = []
-        while not log.is_over:
+        while not log.is_empty:
             message = log.receive(0.05)
             if message is not None:
-                taken.append((clock.now - begin, message.timestamp - BEGIN))
+                taken.append((real.now - begin, message.timestamp - BEGIN))
         assert len(taken) == len(messages)
         assert [at for at, _ in taken] == pytest.approx([stamp / speed for _, stamp in taken], abs=1e-5)
 
@@ -89,9 +98,9 @@ def test_a_recording_is_played_in_its_own_time_or_faster():
 def test_a_stamp_that_goes_back_holds_nothing_up():
     clock = FakeClock()
     early, late = sent(0.2)[0], sent(0.2)[-1]
-    log = PlayedLog([late, early], 1.0, clock, clock.sleep)
-    assert [log.receive(1.0), log.receive(1.0)] == [late, early]
-    assert log.is_over
+    log = played([late, early], clock)
+    assert [log.receive(1.0).timestamp for _ in range(2)] == [late.timestamp, early.timestamp]
+    assert log.is_empty
 
 
 def test_a_clock_that_was_set_while_recording_holds_nothing_up():
@@ -101,9 +110,9 @@ def test_a_clock_that_was_set_while_recording_holds_nothing_up():
     third = len(messages) // 3
     for message in messages[third : 2 * third]:
         message.timestamp += 1.7e9
-    log = PlayedLog(messages, 1.0, clock, clock.sleep)
-    taken = [log.receive(100.0) for _ in messages]
-    assert taken == messages
+    log = played(messages, clock)
+    taken = [log.receive(100.0).timestamp for _ in messages]
+    assert taken == [message.timestamp for message in messages]
     assert clock.now - begin < 3.0 + 60.0
 
 
@@ -112,8 +121,8 @@ def test_the_end_of_a_recording_ends_it_and_its_silences_are_silences():
     late = sent(2.0)
     for message in late:
         message.timestamp += 20.0
-    source = PlayedLog(sent(5.0) + late, 1.0, clock, clock.sleep)
-    said = lines_of(source, clock, lambda: source.is_over, source.now)
+    source = played(sent(5.0) + late, clock)
+    said = lines_of(source, clock, lambda: source.is_empty)
     assert clock.now - 1000.0 == pytest.approx(21.9, abs=0.3)
     assert said[0][1].startswith("UNKNOWN: waiting for 5 frames in a row")
     assert [text[:3] for t, text in said[1:] if t < 5.0] == ["GO,"] * 5
@@ -144,9 +153,9 @@ def test_lines_come_once_a_second_and_at_once_when_the_state_changes():
 @pytest.mark.parametrize(("plain", "kind"), [(True, "xterm-256color"), (False, "dumb")])
 def test_lines_come_on_a_terminal_too_where_they_are_asked_for_or_nothing_else_is_possible(plain, kind):
     clock = FakeClock()
-    source = PlayedLog(sent(4.0), 1.0, clock, clock.sleep)
+    source = played(sent(4.0), clock)
     terminal = {"force_terminal": True, "_environ": {"TERM": kind}}
-    said = lines_of(source, clock, lambda: source.is_over, source.now, plain, **terminal)
+    said = lines_of(source, clock, lambda: source.is_empty, plain, **terminal)
     assert 3 <= len(said) <= 5
     assert "\x1b" not in "".join(text for _, text in said)
 

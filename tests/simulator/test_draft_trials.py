@@ -11,7 +11,7 @@ from soilbus.cli.main import main
 from soilbus.estimation.assembly import rig_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS as KNOWN
-from soilbus.trials.draft_trials import SOILS, DraftTrial, Task, draft_trials, figures, trial, true_largest_draft
+from soilbus.trials.draft_trials import SOILS, DraftTrial, draft_trials, figures, trial, true_largest_draft
 from statics import MODEL, WHEELS, brute
 
 CONFIG = reference_configuration()
@@ -46,7 +46,7 @@ def test_the_largest_draft_is_predicted_on_held_soils():
     assert all(f.error < 0.05 and f.failed == 0 for f in found)
     assert found[-1].drives == 15
     assert 0.86 <= found[-1].coverage <= 1.0  # the command looks closer: 15 drives scatter by 6 points
-    assert trial(Task(CONFIG, SOILS[0], 5)) == trial(Task(CONFIG, SOILS[0], 5))
+    assert trial(CONFIG, SOILS[0], 5) == trial(CONFIG, SOILS[0], 5)
 
 
 def test_the_command(tmp_path, capsys):

@@ -16,7 +16,7 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import WheelModel, sinkage, state_on
 from soilbus.trials.draft_trials import true_largest_draft
-from soilbus.trials.verdict_trials import Call, Task, reliability, trial, wilson
+from soilbus.trials.verdict_trials import Call, reliability, trial, wilson
 
 CONFIG = reference_configuration()
 
@@ -81,6 +81,6 @@ def test_a_sinkage_limit_binds_the_truth():
 
 def test_what_the_service_does_not_call_valid_is_never_called_go():
     strict = CONFIG.estimator.model_copy(update={"max_bearing_std": 1e-6})
-    sure, unsure = (trial(Task(c, 5)) for c in (CONFIG, CONFIG.model_copy(update={"estimator": strict})))
+    sure, unsure = (trial(c, 5) for c in (CONFIG, CONFIG.model_copy(update={"estimator": strict})))
     assert (sure.state, unsure.state) == (State.GO, State.CAUTION)
     assert sure.probability == unsure.probability > 0.95

@@ -24,7 +24,7 @@ from soilbus.estimation.assembly import model_of
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior
 from soilbus.offline.columns import TableError
 from soilbus.offline.tables import Run, replay_runs, runs_of_columns
-from soilbus.report.soil_prior import SHOWN
+from soilbus.pipeline.outputs import PARAMETER_FRAMES
 from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import Soil
 from soilbus.words import did_you_mean
@@ -202,7 +202,7 @@ class SoilEstimate:
 
     def _parameter_lines(self) -> Iterator[str]:
         for name, found in self.posterior.parameters().items():
-            unit, size = SHOWN[name]
+            _, unit, size = PARAMETER_FRAMES[name]
             before = _plus_minus(Estimate(*self.prior[name]), size)
             yield f"{name + ':':<7}{_quantity(found, size):<26} {unit:<12} (prior {before})"
 

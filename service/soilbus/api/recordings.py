@@ -13,6 +13,7 @@ from typing import Any
 from soilbus.api.residuals import frame_of, plot_residuals, with_pandas
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
+from soilbus.can.mapping import si_unit
 from soilbus.config.edit import with_effects_text
 from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config
@@ -28,7 +29,6 @@ from soilbus.pipeline.outputs import column_names, flat_record, window_record
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.report.findings import findings_record, findings_text
 from soilbus.report.statement import statement
-from soilbus.sensors.survey import si_unit
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import Recording

@@ -89,8 +89,7 @@ def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[candump.F
             try:
                 message = bus.recv(left)
             except (OSError, can.CanError) as error:
-                name = f"{settings.get('interface')}:{settings.get('channel')}"
-                raise BusError(f"bus {name}: {one_line(error)}", may_come=True) from None
+                raise bus_fault(settings, error) from None
             if message is not None:
                 yield candump.frame_of(message)
     finally:
@@ -254,11 +253,17 @@ class LiveBus:
             return None
         self.found_nothing = False
         if message.is_error_frame:
-            self._note_error(message)
+            self._counts.error_frames += 1
+            self._overruns_before += tells_overflow(message.arbitration_id, message.data)
+            before, self.state = self.state, state_told(self.state, message.arbitration_id, message.data)
+            if self.state is not before:
+                log.warning("controller: %s", self.state)
             return None
         if (message.arbitration_id, message.is_extended_id) in self._own:
             if message.is_rx and not message.is_remote_frame:
-                self._note_foreign(message)
+                self._counts.foreign += 1
+                self.last_foreign = self._clock()
+                self._say(f"another node sends our frame {message.arbitration_id:08X}")
             return None
         if self.state is BusState.OFF:  # not any more: nothing is heard in bus-off
             self.state = BusState.UNKNOWN
@@ -274,13 +279,6 @@ class LiveBus:
         """Return the stamp [s] before which no frame can come any more; -inf where that is not known."""
         return -math.inf if self._wire is None else self._wire.heard_until()
 
-    def _note_error(self, message: Received | can.Message) -> None:
-        self._counts.error_frames += 1
-        self._overruns_before += tells_overflow(message.arbitration_id, message.data)
-        before, self.state = self.state, state_told(self.state, message.arbitration_id, message.data)
-        if self.state is not before:
-            log.warning("controller: %s", self.state)
-
     def _note_garbled(self, error: Exception) -> None:
         self._counts.garbled += 1
         self.found_nothing = False
@@ -292,11 +290,6 @@ class LiveBus:
             self._lost(error)
         else:
             self._say(f"the driver could not read a frame: {type(error).__name__}")
-
-    def _note_foreign(self, message: Received | can.Message) -> None:
-        self._counts.foreign += 1
-        self.last_foreign = self._clock()
-        self._say(f"another node sends our frame {message.arbitration_id:08X}")
 
     def send(self, frame: Frame) -> bool:
         """Send a frame, or keep it for a moment if there is no room; return whether nothing waits any more.

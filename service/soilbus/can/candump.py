@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
-from itertools import islice, repeat
+from itertools import repeat
 from operator import index
 
 import can
@@ -128,15 +129,12 @@ def candump_batches(lines: Iterable[str]) -> Iterator[Batch]:
     for batch in _batches(iter(lines)):
         plain = _plain(_DIRECTION.sub("\n", "".join(batch)))
         if plain is None:
-            try:
+            with suppress(ValueError):  # raised again in its turn, after the frames before
                 plain = _plain(_DIRECTION.sub("\n", "".join(map(log_line, batch))))
-            except ValueError:  # raised again in its turn, after the frames before
-                plain = None
         if plain is not None:
             yield plain
         else:
-            lines = (log_line(line) for line in batch)
-            yield from (of_message(message) for message in can.CanutilsLogReader(lines))  # type: ignore[arg-type]
+            yield from map(of_message, can.CanutilsLogReader(log_line(line) for line in batch))  # type: ignore[arg-type]
 
 
 def of_message(message: can.Message, first: int = 0) -> Batch:
@@ -148,18 +146,17 @@ def of_message(message: can.Message, first: int = 0) -> Batch:
 
 def _batches(lines: Iterator[str]) -> Iterator[list[str]]:
     """Lines in lists of BATCH; what was read before an error comes before the error."""
-    full = True
-    while full:
-        batch: list[str] = []
-        failure: Exception | None = None
-        try:
-            batch.extend(islice(lines, BATCH))
-        except Exception as error:
-            failure = error
+    batch: list[str] = []
+    try:
+        for line in lines:
+            batch.append(line)
+            if len(batch) == BATCH:
+                yield batch
+                batch = []
+    except Exception:
         yield batch
-        if failure is not None:
-            raise failure
-        full = len(batch) == BATCH
+        raise
+    yield batch
 
 
 def _plain(text: str) -> Batch | None:

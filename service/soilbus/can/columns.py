@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 from cantools.database.can import Database, Message, Signal
@@ -36,17 +37,11 @@ def unit_in(column: str) -> str:
         return found[1]
     found = _BEHIND.fullmatch(column)
     while found is not None:
-        if (len(found[1]) > 1 or found[1] in LETTERS) and _is_unit(found[1]):
-            return found[1]
+        with suppress(ValueError):
+            if (len(found[1]) > 1 or found[1] in LETTERS) and unit_of(found[1]) is not None:
+                return found[1]
         found = _BEHIND.fullmatch(found[1])
     return ""
-
-
-def _is_unit(text: str) -> bool:
-    try:
-        return unit_of(text) is not None
-    except ValueError:
-        return False
 
 
 def column_database(units: Mapping[str, str]) -> Database:
@@ -76,17 +71,14 @@ def mapped_columns(config: Config) -> dict[str, str]:
     }
 
 
-def mapped_signals(config: Config) -> list[Mapping[str, Any]]:
-    """Return the keys of each signal that the configuration maps."""
-    return list(_signals(config.model_dump(exclude={"columns", "table", "folder"})))
-
-
-def _signals(section: Any) -> Iterator[Mapping[str, Any]]:
-    """All tables that name a signal."""
+def mapped_signals(section: Any) -> Iterator[Mapping[str, Any]]:
+    """Yield the keys of each signal that a configuration or a part of it maps."""
+    if isinstance(section, Config):
+        section = section.model_dump(exclude={"columns", "table", "folder"})
     if isinstance(section, Mapping):
         if isinstance(section.get("signal"), str):
             yield section
         section = list(section.values())
     if isinstance(section, list):
         for part in section:
-            yield from _signals(part)
+            yield from mapped_signals(part)

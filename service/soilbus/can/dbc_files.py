@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from copy import copy
 from functools import lru_cache
 from pathlib import Path
@@ -68,8 +69,11 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
     `dbc.checked` names in the database; what another maker's Checksum means is not known.  Raises ConfigError
     with a line for each name that is in no DBC or cannot be checked.
     """
-    ours = [path for name in config.dbc.input if _is_shipped(path := located(config.folder, name))]
-    found = {m.name for path in ours for m in _read(path).messages if checkable_byte(m) is not None}
+    found: set[str] = set()
+    for path in (located(config.folder, name) for name in config.dbc.input):
+        with suppress(FileNotFoundError):  # of the name of one that is shipped
+            if shipped_dbc(path.name).resolve() == path.resolve():
+                found |= {m.name for m in _read(path).messages if checkable_byte(m) is not None}
     known = {m.name: m for m in database.messages}
     faults = []
     for name in config.dbc.checked:
@@ -79,7 +83,7 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
             faults.append(f"dbc.checked: {name} has no {COUNTER} and byte-aligned 8-bit {CHECKSUM}")
     if faults:
         raise ConfigError(faults)
-    return frozenset(found | set(config.dbc.checked))
+    return frozenset(found.union(config.dbc.checked))
 
 
 def output_database(config: Config) -> Database:
@@ -138,13 +142,6 @@ def _read_named(key: str, folder: Path, name: str, names: set[str] | None = None
     except Exception as error:  # the parser raises all kinds on a text that is no DBC
         why = f"not a DBC file: {one_line(error)}"
     raise ConfigError([f"{key}: {name}: {why}"])
-
-
-def _is_shipped(path: Path) -> bool:
-    try:
-        return shipped_dbc(path.name).resolve() == path.resolve()
-    except FileNotFoundError:
-        return False
 
 
 def _read(path: Path, names: set[str] | None = None) -> Database:

@@ -7,7 +7,7 @@ Every value equals that of `cantools.database.can.Message.decode(..., decode_cho
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -72,7 +72,12 @@ class ColumnDecoder:
                 if plan.place not in words:
                     words[plan.place] = _words(payload, plan.place)
                 raw = _codes(plan, words[plan.place])
-                columns[plan.signal.name] = SignalColumn(raw, _scaled(plan, raw), _presence(plan.signal, columns))
+                present: NDArray[np.bool_] | None = None
+                if plan.signal.multiplexer_signal is not None:  # whose own presence is known already
+                    above = columns[plan.signal.multiplexer_signal]
+                    present = np.isin(above.physical, list(plan.signal.multiplexer_ids or ()))
+                    present = present if above.present is None else present & above.present
+                columns[plan.signal.name] = SignalColumn(raw, _scaled(plan, raw), present)
         return columns
 
 
@@ -113,15 +118,6 @@ def _with_multiplexers(message: Message, names: Sequence[str]) -> list[Signal]:
         if name not in ordered:
             add(name)
     return list(ordered.values())
-
-
-def _presence(signal: Signal, columns: Mapping[str, SignalColumn]) -> NDArray[np.bool_] | None:
-    """Where the multiplexer of a signal selects it; the multiplexer's own presence is known already."""
-    if signal.multiplexer_signal is None:
-        return None
-    above = columns[signal.multiplexer_signal]
-    mask: NDArray[np.bool_] = np.isin(above.physical, list(signal.multiplexer_ids or ()))
-    return mask if above.present is None else mask & above.present
 
 
 # --- bits ---

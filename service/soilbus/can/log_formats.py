@@ -47,10 +47,6 @@ class Format(NamedTuple):
     batches: Callable[[BufferedReader], Iterator[Batch]]
 
 
-class MissingExtraError(Exception):
-    """The extra that reads this format is not installed; the text says what to install."""
-
-
 def format_of(head: bytes) -> Format:
     """Return the format of a log by its first bytes; ValueError says what it is instead."""
     for mark, found in _BINARY.items():
@@ -69,7 +65,7 @@ def format_of(head: bytes) -> Format:
     first = lines[0]
     if first.startswith("***BUSMASTER"):
         return Format("BUSMASTER log", lambda stream: busmaster(text_lines(stream)))
-    if csv := _csv_of(first):
+    if csv := csv_of_frames(first):
         return Format(csv.name, lambda stream: _of_csv(csv, text_lines(stream)))
     if first.startswith(";") or _TRC_LINE.match(first):
         return Format("PCAN TRC log", lambda stream: map(of_message, can.TRCReader(text_lines(stream))))  # type: ignore[arg-type]
@@ -159,14 +155,9 @@ def _names(header: str) -> list[str]:
     return [cell.strip().lower() for cell in header.replace(";", ",").split(",")]
 
 
-def _csv_of(header: str) -> _Csv | None:
-    """The kind of CSV with this first line; None where it is none of frames."""
+def csv_of_frames(header: str) -> _Csv | None:
+    """Return the kind of CSV of frames with this first line; None of any other."""
     return next((csv for csv in _ROWS if csv.columns <= set(_names(header))), None)
-
-
-def is_csv_of_frames(header: str) -> bool:
-    """Return whether a CSV with this first line is a log of frames."""
-    return _csv_of(header) is not None
 
 
 def _of_csv(csv: _Csv, lines: Iterable[str]) -> Iterator[Batch]:
@@ -289,10 +280,6 @@ class _PlainBlf(RawIOBase):
         return head + self._CONTAINER.pack(method, len(content)) + content + bytes(size % 4)
 
 
-def _blf(stream: BufferedReader) -> Iterator[Batch]:
-    return (of_message(message, 1) for message in can.BLFReader(_PlainBlf(stream)))  # type: ignore[arg-type]
-
-
 @contextmanager
 def placed_copy(stream: BufferedReader) -> Iterator[Path]:
     """Give the path of a copy of a stream, for libraries that seek in a file."""
@@ -307,7 +294,7 @@ _MF4_BLOCK = re.compile(rb"##DZ....(.{8})\0{8}(..)([\0-\xff]).(.{4})(.{8})(.{8})
 
 def _mf4(stream: BufferedReader) -> Iterator[Batch]:
     if can.io.mf4.asammdf is None:  # type: ignore[attr-defined]
-        raise MissingExtraError("this format needs soilbus[mf4]")
+        raise ModuleNotFoundError("this format needs soilbus[mf4]")
     with placed_copy(stream) as path:
         check_mf4_blocks(path)
         is_empty = True
@@ -350,14 +337,6 @@ def check_mf4_blocks(path: Path) -> None:
             within_ratio(size, plain)
 
 
-def _mcap(stream: BufferedReader) -> Iterator[Batch]:
-    try:
-        import mcap  # noqa: F401
-    except ModuleNotFoundError:
-        raise MissingExtraError("this format needs soilbus[mcap]") from None
-    return frame_batches(stream)
-
-
 _SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages"
 
 
@@ -384,9 +363,9 @@ def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
 
 
 _BINARY = {
-    b"LOGG": Format("BLF log", _blf),
+    b"LOGG": Format("BLF log", lambda file: (of_message(m, 1) for m in can.BLFReader(_PlainBlf(file)))),  # type: ignore[arg-type]
     b"MDF     4": Format("MF4 log", _mf4),
-    b"\x89MCAP": Format("MCAP log", _mcap),
+    b"\x89MCAP": Format("MCAP log", frame_batches),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
 }
 _NO_FRAMES = {

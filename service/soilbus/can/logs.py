@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import median
 
 from soilbus.can.candump import Batch, Frame
-from soilbus.can.log_formats import HEAD, Format, MissingExtraError, format_of
+from soilbus.can.log_formats import HEAD, Format, format_of
 from soilbus.files import opened, packing, within_ratio
 from soilbus.words import one_line, shown
 
@@ -117,7 +117,7 @@ class Log:
             raise
         except FileNotFoundError:
             raise LogError(f"{self.name}: no such file") from None
-        except MissingExtraError as error:
+        except ModuleNotFoundError as error:
             raise self._of_machine(str(error)) from None
         except MemoryError:
             raise self._of_machine("not enough memory to read it") from None

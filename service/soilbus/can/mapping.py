@@ -41,7 +41,7 @@ LEAST_GAP, GAP_CYCLES = 2.0, 1.5
 """A position is stale after these seconds, or, where the DBC says that it is sent seldom, after these cycles."""
 _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 
-_DIMENSIONS: dict[str, tuple[str, ...]] = {
+DIMENSIONS: Mapping[str, tuple[str, ...]] = {
     "torque": ("torque",),
     "torque_limit": ("torque",),
     "motor_speed": ("rotation",),
@@ -59,6 +59,7 @@ _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "latitude": ("angle",),
     "longitude": ("angle",),
 }
+"""Dimensions that the unit of a role's signal may have, that of its values in SI first."""
 _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
 _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
 
@@ -111,7 +112,12 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
     """
     faults: list[str] = []
     channels: list[Channel] = []
-    for role in _measured_once(config):
+    seen: set[tuple[str, str]] = set()
+    for role in _roles(config):
+        key = (role.quantity, role.mapped.signal)
+        if role.quantity in SHARED_ROLES and isinstance(role.part, Wheel) and key in seen:
+            continue  # the channel of another wheel, too, which came first
+        seen.add(key)
         try:
             channels.append(_channel(config, database, role))
         except _Fault as fault:
@@ -121,6 +127,11 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
     if faults:
         raise ConfigError(faults)
     return channels
+
+
+def si_unit(channel: Channel) -> str:
+    """Return the SI unit of a channel's values; "" of a code."""
+    return SI.get(DIMENSIONS[channel.quantity][0], "")
 
 
 def without_unit(channels: Iterable[Channel], database: Database) -> list[Channel]:
@@ -153,16 +164,6 @@ def _roles(config: Config) -> Iterator[_Role]:
         yield _Role(LOCK, None, config.vehicle.differential_lock, f"vehicle.{LOCK}")
 
 
-def _measured_once(config: Config) -> Iterator[_Role]:
-    """The roles without those whose signal is mapped for another wheel, too: its channel is the first wheel's."""
-    seen: set[tuple[str, str]] = set()
-    for role in _roles(config):
-        key = (role.quantity, role.mapped.signal)
-        if not (role.quantity in SHARED_ROLES and isinstance(role.part, Wheel) and key in seen):
-            yield role
-        seen.add(key)
-
-
 def _channel(config: Config, database: Database, role: _Role) -> Channel:
     message, signal = found_signal(database, role.mapped.signal)
     if role.mapped.unit is not None and signal.name != WHOLE:
@@ -171,6 +172,7 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         raise _Fault("valid is for messages; of a column leave those cells empty that do not count")
     low, high = plausible(config, role.quantity, role.part)
     valid_signal, valid_values = _validity(message, role.mapped)
+    seldom = max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
     return Channel(
         quantity=role.quantity,
         wheel=role.part.name if role.part else "",
@@ -182,17 +184,10 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         high=high,
         valid_signal=valid_signal,
         valid_values=valid_values,
-        timeout=role.mapped.timeout or _usual_timeout(role, message),
+        timeout=role.mapped.timeout or (seldom if role.quantity in POSITION_ROLES else None),
         delay=role.mapped.delay,
         key=role.where,
     )
-
-
-def _usual_timeout(role: _Role, message: Message) -> float | None:
-    """Age [s] from which a channel is stale if the configuration does not say; None: as any other."""
-    if role.quantity not in POSITION_ROLES:
-        return None
-    return max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
 
 
 def found_signal(database: Database, path: str) -> tuple[Message, Signal]:
@@ -267,12 +262,19 @@ def _factor(role: _Role, signal: Signal) -> float:
 
 def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
     """Dimension and factor to SI of a signal, which must suit the quantity; no unit means SI."""
-    fitting = _DIMENSIONS[quantity]
+    fitting = DIMENSIONS[quantity]
     if fitting == ("",):
-        return _code(quantity, signal)
-    for key in _NUMBERS:
+        if _unit_said(signal):
+            raise _Fault(f"{_called(signal)} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
+        return "", 1.0
+    for key, rule in _NUMBERS.items():
         if (number := getattr(mapped, key)) is not None:
-            return _by_number(quantity, signal, key, number)
+            if quantity not in rule.roles:
+                raise _Fault(f"{key} has no meaning for {quantity}")
+            said = (signal.unit or rule.bare).strip()
+            if said not in rule.units:
+                raise _Fault(f"{_called(signal)} is in {said}; with {key} it must be {rule.wanted}")
+            return rule.dimension, number * rule.units[said]
     wanted = " or ".join(SI[dimension] for dimension in fitting)
     try:
         unit = unit_of(signal.unit)
@@ -294,24 +296,6 @@ def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
 
 def _called(signal: Signal) -> str:
     return signal.name or "the column"
-
-
-def _code(quantity: str, signal: Signal) -> tuple[str, float]:
-    """No dimension; a fault for a signal with a unit of one."""
-    if _unit_said(signal):
-        raise _Fault(f"{_called(signal)} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
-    return "", 1.0
-
-
-def _by_number(quantity: str, signal: Signal, key: str, number: float) -> tuple[str, float]:
-    """Dimension and factor to SI of a signal for which the mapping gives a number."""
-    rule = _NUMBERS[key]
-    if quantity not in rule.roles:
-        raise _Fault(f"{key} has no meaning for {quantity}")
-    unit = rule.units.get((signal.unit or rule.bare).strip())
-    if unit is None:
-        raise _Fault(f"{_called(signal)} is in {signal.unit or rule.bare}; with {key} it must be {rule.wanted}")
-    return rule.dimension, number * unit
 
 
 def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple[float, float]:

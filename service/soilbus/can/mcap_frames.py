@@ -17,21 +17,13 @@ import can
 from soilbus.can.candump import Batch, Frame, of_message
 from soilbus.files import LIMITS, within_ratio
 
+_STAMP = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}}}
+_CHANNEL = {"type": "string", "description": "channel of the bus"}
 FRAME_SCHEMA = {
     "title": "can_msgs/Frame",
     "type": "object",
     "properties": {
-        "header": {
-            "type": "object",
-            "properties": {
-                "stamp": {
-                    "type": "object",
-                    "title": "time",
-                    "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}},
-                },
-                "frame_id": {"type": "string", "description": "channel of the bus"},
-            },
-        },
+        "header": {"type": "object", "properties": {"stamp": _STAMP, "frame_id": _CHANNEL}},
         "id": {"type": "integer", "description": "identifier, without flags"},
         "is_rtr": {"type": "boolean"},
         "is_extended": {"type": "boolean"},
@@ -66,8 +58,10 @@ def frame_message(channel: str, frame: Frame) -> dict[str, Any]:
 
 def frame_batches(stream: BufferedReader) -> Iterator[Batch]:
     """Yield the frames of an MCAP log in the order of the file; ValueError where it has none."""
-    from mcap.records import Channel, Message, Schema
-
+    try:
+        from mcap.records import Channel, Message, Schema
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("this format needs soilbus[mcap]") from None
     schemas: set[int] = set()
     channels: set[int] = set()
     is_empty = True

@@ -111,14 +111,6 @@ def value_codes(signal: Signal) -> ValueCodes:
     )
 
 
-def _codes_of(message: Message, signal: Signal) -> ValueCodes:
-    """`value_codes`, in whose errors the message is named."""
-    try:
-        return value_codes(signal)
-    except ValueError as error:
-        raise ValueError(f"{message.name}.{error}") from None
-
-
 def _valid_codes(signal: Signal, least: int, greatest: int) -> tuple[int, int]:
     """First and last code within the DBC's range, of those that the bits can hold."""
     bounds = (signal.minimum, signal.maximum)
@@ -182,7 +174,10 @@ def _layout(message: Message) -> _Layout:
     if message.is_multiplexed():
         raise ValueError(f"{message.name}: multiplexed messages cannot be sent")
     by_name = {signal.name: signal for signal in message.signals}
-    codes = {name: _codes_of(message, signal) for name, signal in by_name.items() if name not in (COUNTER, CHECKSUM)}
+    try:
+        codes = {name: value_codes(signal) for name, signal in by_name.items() if name not in (COUNTER, CHECKSUM)}
+    except ValueError as error:
+        raise ValueError(f"{message.name}.{error}") from None
     blank = {name: code.not_available for name, code in codes.items()}
     blank |= {name: 0 for name in (COUNTER, CHECKSUM) if name in by_name}
     modulus = 1 << by_name[COUNTER].length if COUNTER in by_name else 0

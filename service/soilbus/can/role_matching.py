@@ -24,6 +24,7 @@ from cantools.database.can import Database, Message, Signal
 
 from soilbus.can.channels import WHOLE, path_of
 from soilbus.can.j1939 import pgn_of
+from soilbus.can.mapping import DIMENSIONS
 from soilbus.can.units import Unit, unit_of
 
 _LETTERS = {"front": "F", "middle": "M", "rear": "R", **{str(k): str(k) for k in range(1, 5)}}
@@ -108,61 +109,61 @@ _GROUPS: Mapping[int, frozenset[str]] = {
 _ASKED = frozenset({"request", "least", "rated"})
 _HITCH = frozenset({"hitch", "draft", "pull", "link"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
-_ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozenset[str]]] = {
+_ROLES: Mapping[str, tuple[float, Mapping[str, float], frozenset[str]]] = {
     "torque": (
-        ("torque",), 0.6,
+        0.6,
         {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
         _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"},
     ),
-    "torque_limit": (("torque",), 0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
+    "torque_limit": (0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
     "motor_speed": (
-        ("rotation",), 0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
+        0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
         _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"},
     ),
     "speed": (
-        ("rotation", "speed"), 0.1, {"wheel": 0.8, "speed": 0.2},
+        0.1, {"wheel": 0.8, "speed": 0.2},
         _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"},
     ),
     "load": (
-        ("force", "mass"), 0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
+        0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
         _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"},
     ),
-    "sinkage": (("length",), 0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
+    "sinkage": (0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
     "ground_speed": (
-        ("speed",), 0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
+        0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
         _ASKED
         | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"}
         | {"relative"},
     ),
     "draft": (
-        ("force",), 0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
+        0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
         _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"},
     ),
     "pitch": (
-        ("angle",), 0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
+        0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
         _ASKED | {"rate", "roll", "lateral", "steering", "hitch"},
     ),
     "roll": (
-        ("angle",), 0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
+        0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
         _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"},
     ),
     "yaw_rate": (
-        ("rotation",), 0.1, {"yaw": 1.0, "rate": 0.2},
+        0.1, {"yaw": 1.0, "rate": 0.2},
         _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"},
     ),
     "acceleration": (
-        ("acceleration",), 0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
+        0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
         _ASKED | {"lateral", "vertical", "limit"},
     ),
     "steering_angle": (
-        ("angle",), 0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
+        0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
         _ASKED | {"hand", "column", "rate", "limit", "fraction"},
     ),
-    "latitude": (("angle",), 0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
-    "longitude": (("angle",), 0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
-    "differential_lock": (("",), 0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
+    "latitude": (0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
+    "longitude": (0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
+    "differential_lock": (0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
 }  # fmt: skip
-"""Of each role: dimensions of its unit, score of a fitting unit, weights of words, words that speak against it."""
+"""Of each role: score of a fitting unit, weights of words, words that speak against it."""
 FEWEST_BITS = 7
 """Length of the shortest signal that measures anything; shorter ones are codes and flags."""
 COARSEST_POSITION = 2e-5
@@ -307,11 +308,6 @@ def _take_sole(out: Assignment) -> None:
             del out.open[slot]
 
 
-def dimensions_of(role: str) -> tuple[str, ...]:
-    """Return the dimensions that the unit of a role's signal may have."""
-    return _ROLES[role][0]
-
-
 def described(candidate: Candidate) -> str:
     """Return a candidate for a comment: path, unit and what speaks against it."""
     said = [candidate.unit] * bool(candidate.unit) + list(candidate.notes)
@@ -358,14 +354,15 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: M
     if signal.name == WHOLE:
         around = own
     found = []
-    for role, (dimensions, *_) in _ROLES.items():
+    for role in _ROLES:
+        dimensions = DIMENSIONS[role]
         if unit is not None and unit.dimension not in dimensions:
             continue
         if signal.length < FEWEST_BITS and dimensions != ("",):
             continue
         at_wheel = place in WHEELS
         score = _score(role, own, around, _words(comment), unit, at_wheel) + _by_range(role, signal, unit, own)
-        slot = Slot(role, _place_of(role, place))
+        slot = Slot(role, place if role in WHEEL_AND_AXLE or (role in WHEEL_ONLY and at_wheel) else "")
         notes: tuple[str, ...] = ("no unit: SI assumed",) if unit is None and dimensions != ("",) else ()
         if role in WHEEL_ONLY and slot.place not in WHEELS:
             notes += ("not of one wheel",)
@@ -407,12 +404,12 @@ def _score(
     unit: Unit | None,
     at_wheel: bool,
 ) -> float:
-    dimensions, base, weights, against = _ROLES[role]
+    base, weights, against = _ROLES[role]
     if at_wheel:
         against = against - _HITCH  # a load pin is in a wheel's hub, too
         around = around | {"wheel"} if role == "speed" else around
     is_bare = not own - {"front", "middle", "rear", "speed"}  # it only says where, or how fast: the message says what
-    score = base if unit is not None or dimensions == ("",) else -_NO_UNIT
+    score = base if unit is not None or DIMENSIONS[role] == ("",) else -_NO_UNIT
     for word, weight in weights.items():
         share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
         score += weight * max(share, IN_COMMENT if word in comment else 0.0)
@@ -429,21 +426,16 @@ def _score(
 
 def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str]) -> float:
     """What the range of the DBC, in SI, adds to a score."""
-    low, high = (
-        math.nan if limit is None else float(limit) * (unit.factor if unit else 1.0)
-        for limit in (signal.minimum, signal.maximum)
-    )
+    factor = unit.factor if unit else 1.0
+    low, high = (math.nan if end is None else float(end) * factor for end in (signal.minimum, signal.maximum))
     extent = max(abs(low), abs(high)) if math.isfinite(low) and math.isfinite(high) else math.nan
     if role == "steering_angle":
         # the hand wheel turns further, and is what "steering angle" means on a car
         return -1.0 if extent > 1.6 or {"steering", "wheel"} <= own else 0.0 if extent > 0.0 else -0.3
     if role in ("latitude", "longitude"):
         least = (math.pi / 2.0 if role == "latitude" else math.pi) - 1e-6
-        coarse = not signal.conversion.is_float
-        is_part = (
-            coarse and float(signal.scale) * (unit.factor if unit else 1.0) > COARSEST_POSITION
-        )  # minutes stand elsewhere
-        return -1.0 if extent < least or low >= 0.0 or is_part else 0.0
+        is_coarse = not signal.conversion.is_float and float(signal.scale) * factor > COARSEST_POSITION
+        return -1.0 if extent < least or low >= 0.0 or is_coarse else 0.0  # its minutes stand elsewhere
     if role in ("pitch", "roll"):
         return -1.0 if extent > 2.0 * math.pi - 0.1 or low >= 0.0 else 0.0  # a course
     if role in ("torque", "draft", "acceleration", "yaw_rate") and low >= 0.0:
@@ -451,12 +443,6 @@ def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str])
     if role == "torque_limit" and low < 0.0 and high <= 0.0:
         return -2.0  # of the generator
     return 0.0
-
-
-def _place_of(role: str, place: str) -> str:
-    if role in WHEEL_ONLY:
-        return place if place in WHEELS else ""
-    return place if role in WHEEL_AND_AXLE else ""
 
 
 # --- words ---
@@ -470,11 +456,9 @@ PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"
 def _tokens(text: str) -> tuple[str, ...]:
     """Pieces of a name: at underscores, capitals and digits, and whole words run together."""
     pieces = re.findall(PIECE, text)
-    return tuple(part for piece in pieces for part in _parted(_singular(piece.casefold())))
-
-
-def _singular(piece: str) -> str:
-    return piece[:-1] if piece not in _WORDS and piece[:-1] in _WORDS and piece.endswith("s") else piece
+    small = [piece.casefold() for piece in pieces]
+    singular = (p[:-1] if p not in _WORDS and p[:-1] in _WORDS and p.endswith("s") else p for p in small)
+    return tuple(part for piece in singular for part in _parted(piece))
 
 
 def _parted(piece: str) -> tuple[str, ...]:

@@ -21,17 +21,9 @@ from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn, code_limits
 
 __all__ = [
-    "REASONS",
-    "CodeRule",
-    "Verdicts",
-    "in_si",
-    "judge_codes",
-    "judge_validity",
-    "meaning",
-    "rule_of",
-    "vouches",
-    "vouching_codes",
-]
+    "REASONS", "CodeRule", "Verdicts", "in_si", "judge_codes", "judge_validity", "meaning", "rule_of", "vouches",
+    "vouching_codes"
+]  # fmt: skip
 
 REASONS = tuple(Reason)
 """A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
@@ -74,8 +66,11 @@ def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
     """
     named = tuple((code, reason) for code, name in (signal.choices or {}).items() if (reason := meaning(str(name))))
     if signal.conversion.is_float:
-        low, high = _float_range(signal)
-        return CodeRule(low, high, True, None, named)
+        low = -math.inf if signal.minimum is None or not _has_range(signal) else float(signal.minimum)
+        high = math.inf if signal.maximum is None or not _has_range(signal) else float(signal.maximum)
+        # a float32 signal may pass a limit by its own rounding
+        eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
+        return CodeRule(low - eps * abs(low), high + eps * abs(high), True, None, named)
     first, last = code_limits(signal)
     least, greatest = _code_range(signal, first, last)
     special: dict[int, Reason] = {}
@@ -125,8 +120,9 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
     all_within = not outside.any()
     if not all_within:
         verdict[outside] = _VERDICT[Reason.OUT_OF_RANGE]
-        if rule.bands is not None:
-            _mark_bands(verdict, raw, outside, rule.bands)
+        reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
+        for first, reason in zip(rule.bands or (), reasons, strict=False):
+            verdict[outside & (raw >= first)] = _VERDICT[reason]
     if rule.is_float:
         verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
     for code, reason in rule.special:
@@ -160,26 +156,10 @@ def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArra
     return value
 
 
-def _mark_bands(verdict: Verdicts, raw: NDArray[Any], outside: NDArray[np.bool_], bands: tuple[int, int, int]) -> None:
-    reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
-    for first, reason in zip(bands, reasons, strict=True):
-        verdict[outside & (raw >= first)] = _VERDICT[reason]
-
-
 def _has_range(signal: Signal) -> bool:
     if signal.minimum is None and signal.maximum is None:
         return False
     return not signal.minimum == signal.maximum == 0
-
-
-def _float_range(signal: Signal) -> tuple[float, float]:
-    """Physical limits; a float32 signal may pass a limit by its own rounding."""
-    if not _has_range(signal):
-        return -math.inf, math.inf
-    low = -math.inf if signal.minimum is None else float(signal.minimum)
-    high = math.inf if signal.maximum is None else float(signal.maximum)
-    eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
-    return low - eps * abs(low), high + eps * abs(high)
 
 
 def _code_range(signal: Signal, first: int, last: int) -> tuple[int, int]:

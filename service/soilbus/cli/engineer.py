@@ -382,7 +382,9 @@ def batch(args: argparse.Namespace) -> None:
     config = configured(args)
     for module in ("distributed", "pyarrow"):
         need_extra(module, "batch", "batch")
-    from soilbus.offline.batch import BatchError, check_out, cluster, jobs_of, results_in, run_batch
+    from soilbus.offline.batch import check_out, results_in, run_batch
+    from soilbus.offline.cluster import BatchError, cluster
+    from soilbus.offline.jobs import jobs_of
     from soilbus.report.batch import batch_text
     from soilbus.report.progress import phases
 

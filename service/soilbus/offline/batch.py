@@ -5,7 +5,7 @@
 Only logs that have no part yet are replayed, so a run that is stopped loses only the logs in work. The fault of a log
 is kept as well, and the state of its file: a log whose file changed is read again. Workers need neither the
 configuration nor the DBC files nor the output folder: settings travel with a job, and parts come back. Workers open a
-log by its path or URL; where they do not see the path, it is sent along.
+log by its path or URL.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -27,21 +26,16 @@ from soilbus.export.table import parquet_of
 from soilbus.files import LIMITS, read_bounded
 from soilbus.grouping import grouped
 from soilbus.offline import dataset
-from soilbus.offline.cluster import BatchError, cluster, done_in_turn
+from soilbus.offline.cluster import BatchError, done_in_turn
 from soilbus.offline.fleet import chosen, effect_rows, findings_of, judged, no_findings
-from soilbus.offline.jobs import jobs_of
-from soilbus.offline.parts import Job, Kept, Outcome, kept_of, part_of, part_path
+from soilbus.offline.parts import Job, Outcome, kept_of, part_of, part_path
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line, shown
-
-__all__ = ["Batch", "BatchError", "check_out", "cluster", "jobs_of", "results_in", "run_batch"]
 
 STATES_AT_ONCE = 32
 """Files that are asked for their state at once: of 80 000 logs on a server that answers in 50 ms in two minutes."""
 OF_DIAGNOSIS = ("diagnosis.json", "effects.parquet")
 """What `--diagnose` writes."""
-MAX_SENT_BYTES = 256 * 2**20
-"""Bytes of a log that is sent along; it is in memory on its way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,21 +146,18 @@ def run_batch(
     )
 
 
-def _all_kept(jobs: Sequence[Job], parts: Path) -> dict[str, Kept]:
+def _all_kept(jobs: Sequence[Job], parts: Path) -> dict[str, Outcome]:
     """What came before, by digest, of logs whose files are still the same; what is there of others is removed."""
+    same = {}
     with ThreadPoolExecutor(STATES_AT_ONCE) as threads:
-        kept = dict(zip((job.digest for job in jobs), threads.map(lambda job: _kept(parts, job), jobs), strict=True))
-    same = {digest: one for digest, one in kept.items() if one is not None}
-    for digest in kept.keys() - same.keys():
-        for path in parts.glob(f"{digest}.*"):
-            path.unlink()
+        for job, state in zip(jobs, threads.map(lambda job: _state_of(job.log), jobs), strict=True):
+            kept = kept_of(parts, job.digest)
+            if kept is not None and kept.is_of(*state):
+                same[job.digest] = kept
+            else:
+                for path in parts.glob(f"{job.digest}.*"):
+                    path.unlink()
     return same
-
-
-def _kept(parts: Path, job: Job) -> Kept | None:
-    """What came of a log before; None where there is nothing, its part is lost, or its file is another one."""
-    kept = kept_of(parts, job.digest)
-    return kept if kept is not None and kept.is_of(*_state_of(job.log)) else None
 
 
 def _state_of(log: str) -> tuple[int | None, int | None]:
@@ -187,29 +178,27 @@ def _state_of(log: str) -> tuple[int | None, int | None]:
 
 
 def _replay_all(
-    client: Any, jobs: Sequence[Job], parts: Path, before: Mapping[str, Kept], progress: Callable[[str], None]
-) -> dict[str, Kept]:
+    client: Any, jobs: Sequence[Job], parts: Path, before: Mapping[str, Outcome], progress: Callable[[str], None]
+) -> dict[str, Outcome]:
     """What comes of each log of which nothing is kept, by digest; on disk where the same log gives it again."""
     left = {job.digest: job for job in jobs if job.digest not in before}
-    found: dict[str, Kept] = {}
+    found: dict[str, Outcome] = {}
     states: dict[str, tuple[int | None, int | None]] = {}
-    unseen = _unseen_folders(client, left.values())
 
     def task(job: Job) -> tuple[Job]:
         states[job.digest] = (None, None) if "://" in job.log else _state_of(job.log)
-        return (_carrying(job, unseen),)
+        return (job,)
 
     failed = 0
     for digest, result in done_in_turn(client, part_of, ((digest, task(job)) for digest, job in left.items())):
-        of = result if isinstance(result, Outcome) else _failed(left[digest], result)
+        of, part = (_failed(left[digest], result), b"") if isinstance(result, BaseException) else result
         size, changed = states.pop(digest)
-        size = of.size if size is None else size
-        found[digest] = Kept(of.fault, of.summary, len(of.part), of.other_bus, size, changed)
-        if of.part:
-            dataset.put(part_path(parts, digest), of.part)
-        if of.part or of.lasting:  # last: with it the log is done
-            dataset.put(parts / f"{digest}.json", json.dumps(asdict(found[digest]), allow_nan=False).encode())
-        failed += not of.part
+        found[digest] = of = replace(of, size=of.size if size is None else size, changed=changed)
+        if part:
+            dataset.put(part_path(parts, digest), part)
+        if part or of.lasting:  # last: with it the log is done
+            dataset.put(parts / f"{digest}.json", json.dumps(asdict(of), allow_nan=False).encode())
+        failed += not part
         progress(f"{len(before) + len(found)} of {len(jobs)} logs" + (f", {failed} failed" if failed else ""))
     return found
 
@@ -219,36 +208,6 @@ def _failed(job: Job, error: BaseException) -> Outcome:
     if type(error).__name__ == "KilledWorker":
         return Outcome(f"{job.log}: its worker died each time it was tried (out of memory?)")
     return Outcome(f"{job.log}: {one_line(Exception(str(error)), 200)} ({type(error).__name__})")
-
-
-def unseen_of(folders: Sequence[str]) -> list[str]:
-    """Return those of the folders that are not on this machine."""
-    return [folder for folder in folders if not Path(folder).is_dir()]
-
-
-def _unseen_folders(client: Any, jobs: Iterable[Job]) -> set[str]:
-    """Folders of logs that are here and that some worker does not see."""
-    folders = sorted({str(Path(job.log).parent) for job in jobs if "://" not in job.log})
-    here = [folder for folder in folders if Path(folder).is_dir()]
-    return {folder for unseen in client.run(unseen_of, here).values() for folder in unseen} if here else set()
-
-
-def _carrying(job: Job, unseen: set[str]) -> Job:
-    """The job with its log where workers do not see it, or why it is not sent along."""
-    if "://" in job.log or str(Path(job.log).parent) not in unseen:
-        return job
-    path = Path(job.log)
-    try:
-        size = path.stat().st_size
-        if size <= MAX_SENT_BYTES:
-            return replace(job, content=path.read_bytes())
-    except FileNotFoundError:
-        return job
-    except OSError as error:
-        return replace(job, not_sent=f"{job.log}: {one_line(error, 200)}")
-    what = f"workers do not see this path, and with {math.ceil(size / 2**20)} MiB it is too large to be sent along"
-    how = f"(at most {MAX_SENT_BYTES / 2**20:g} MiB): put it where they see the same path, or name it by a URL"
-    return replace(job, not_sent=f"{job.log}: {what} {how}")
 
 
 def _diagnose_all(
@@ -280,10 +239,20 @@ def _diagnosed(
     retry: bool,
 ) -> list[dict[str, Any]]:
     """Findings of each vehicle; those that are kept are not made again."""
-    kept = [parts / f"{_digest_of(jobs, parts)}.json" for jobs in vehicles]
-    left = {path.stem: v for v, path in enumerate(kept) if not _are_kept(path, retry)}
-    unseen = _unseen_folders(client, (job for v in left.values() for job in vehicles[v]))
-    tasks = ((digest, ([_carrying(job, unseen) for job in vehicles[v]],)) for digest, v in left.items())
+
+    def is_kept(path: Path) -> bool:
+        """Whether a vehicle's findings are there; with `retry` those that lack a log are not."""
+        findings = json.loads(read_bounded(path, LIMITS.whole)) if retry and path.exists() else {}
+        return path.exists() and not (findings.get("fault") or findings.get("left_out"))
+
+    kept = []
+    for jobs in vehicles:
+        of = hashlib.sha256()  # of its logs as they were read
+        for job in jobs:
+            of.update(job.digest.encode() + (parts / f"{job.digest}.json").read_bytes())
+        kept.append(parts / f"{of.hexdigest()[:24]}.json")
+    left = {path.stem: v for v, path in enumerate(kept) if not is_kept(path)}
+    tasks = ((digest, (vehicles[v],)) for digest, v in left.items())
     for n, (digest, findings) in enumerate(done_in_turn(client, findings_of, tasks), 1):
         if isinstance(findings, BaseException):
             fault = f"{one_line(Exception(str(findings)), 200)} ({type(findings).__name__})"
@@ -291,19 +260,3 @@ def _diagnosed(
         dataset.put(kept[left[digest]], json.dumps(known(findings), indent=1, allow_nan=False).encode())
         progress(f"{n} of {len(left)} vehicles diagnosed")
     return [json.loads(read_bounded(path, LIMITS.whole)) for path in kept]
-
-
-def _are_kept(path: Path, retry: bool) -> bool:
-    """Whether a vehicle's findings are there; with `retry` those that lack a log are not."""
-    if not path.exists():
-        return False
-    findings = json.loads(read_bounded(path, LIMITS.whole)) if retry else {}
-    return not (findings.get("fault") or findings.get("left_out"))
-
-
-def _digest_of(jobs: Sequence[Job], parts: Path) -> str:
-    """Names the findings of a vehicle: of its logs as they were read."""
-    of = hashlib.sha256()
-    for job in jobs:
-        of.update(job.digest.encode() + (parts / f"{job.digest}.json").read_bytes())
-    return of.hexdigest()[:24]

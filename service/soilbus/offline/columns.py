@@ -21,11 +21,9 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.can.candump import Frame
-from soilbus.can.columns import mapped_columns, unit_in
 from soilbus.can.log_formats import check_mf4_blocks, placed_copy
 from soilbus.can.logs import LEAST_STAMPS, MOST_BACKWARDS, LogError
 from soilbus.config.model import Columns as TimeColumn
-from soilbus.config.model import Config
 from soilbus.files import LIMITS, opened, packing, plain_bytes, read_all, text_lines
 from soilbus.words import did_you_mean, one_line, shown
 
@@ -82,7 +80,11 @@ def kind_of(path: Path) -> str:
 
 
 def _csv(path: Path, needed: Sequence[str] | None) -> Columns:
-    rows, separator = _csv_rows(path, needed or ())
+    try:
+        with opened(path) as stream:
+            rows, separator = csv_rows(stream, needed or ())
+    except (ValueError, csv.Error) as error:
+        raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
     if not rows:
         raise TableError(f"{path}: no row in it")
     header = [name.strip() for name in rows[0]]
@@ -94,15 +96,6 @@ def _csv(path: Path, needed: Sequence[str] | None) -> Columns:
     places = {name: header.index(name) for name in needed}
     columns = {name: [row[place] for row in rows[1:]] for name, place in places.items()}
     return columns if separator == "," else _with_points(columns)
-
-
-def _csv_rows(path: Path, needed: Sequence[str]) -> tuple[list[list[str]], str]:
-    """Rows of a file with cells, and what separates these."""
-    try:
-        with opened(path) as stream:
-            return csv_rows(stream, needed)
-    except (ValueError, csv.Error) as error:
-        raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
 
 
 def csv_rows(stream: Any, names: Collection[str]) -> tuple[list[list[str]], str]:
@@ -252,12 +245,6 @@ class SignalTable:
             yield stamp, column, column >= 1 << 11, data[8 * i : 8 * i + 8], False, False
 
 
-def signal_table(config: Config, path: Path) -> SignalTable:
-    """Return the table of a configuration with [columns]."""
-    assert config.columns is not None
-    return SignalTable(path, config.columns, list(mapped_columns(config)))
-
-
 def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = None) -> dict[str, Samples]:
     """Return the samples of a table by column; of all columns with numbers by default.
 
@@ -273,7 +260,8 @@ def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = Non
     if time.time not in cells:
         raise TableError(f"{path}: no column {time.time}{did_you_mean(time.time, cells)}")
     units = {name: str(column[0]).strip() for name, column in cells.items() if len(column)}
-    begin = int(bool(units) and _is_no_time(cells[time.time][0]) and bool(str(cells[time.time][0]).strip()))
+    first = cells[time.time][0] if units else None
+    begin = int(bool(str(first or "").strip()) and math.isinf(number(first)) and _date(first) is None)
     t = _times(path, time, cells[time.time][begin:])
     order = np.arange(len(t), dtype=np.float64)
     series = {}
@@ -290,10 +278,6 @@ def time_column(path: Path) -> str:
         return ""
     names = list(read_columns(path, None))
     return next((name for name in names if TIME_NAMES.fullmatch(re.split(r"[ _\[(/]", name)[0] or "index")), "")
-
-
-def _is_no_time(cell: Any) -> bool:
-    return not isinstance(cell, datetime) and math.isinf(number(cell)) and _date(cell) is None
 
 
 def _date(cell: Any) -> float | None:
@@ -360,8 +344,3 @@ def _mf4(path: Path, names: Sequence[str] | None) -> dict[str, Samples]:
 def _channel(signal: Any, start: float) -> Samples:
     t = np.asarray(signal.timestamps, np.float64) + start
     return Samples(t, np.asarray(signal.samples, np.float64), t, str(signal.unit or ""))
-
-
-__all__ = [
-    "Columns", "SignalTable", "TableError", "read_columns", "read_samples", "signal_table", "time_column", "unit_in",
-]  # fmt: skip

@@ -54,6 +54,7 @@ GEO = {
 }
 """Metadata `geo` of GeoParquet 1.1; without a `crs` coordinates are longitude and latitude in WGS84 (OGC:CRS84)."""
 _WKB_POINT = np.dtype([("order", "u1"), ("kind", "<u4"), ("x", "<f8"), ("y", "<f8")])
+"""A point as well-known binary (OGC 06-103r4)."""
 
 
 def can_be_folder(vehicle: str) -> bool:
@@ -147,15 +148,9 @@ def _write_map(path: Path, rows: Any) -> None:
     batches = rows.to_batches([*columns, "longitude", "latitude"], filter=ds.field("longitude").is_valid())
     with whole_file_of_bytes(path) as out, pq.ParquetWriter(out, schema) as writer:
         for batch in batches:
-            geometry = _points(batch.column("longitude"), batch.column("latitude"))
+            points = np.empty(len(batch), _WKB_POINT)
+            points["order"], points["kind"] = 1, 1
+            points["x"], points["y"] = (batch.column(name).to_numpy() for name in ("longitude", "latitude"))
+            geometry = pa.array([point.tobytes() for point in points], pa.binary())
             arrays = [*(batch.column(name) for name in columns), geometry]
             writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
-
-
-def _points(longitude: Any, latitude: Any) -> Any:
-    """Points as a pyarrow array of well-known binary (OGC 06-103r4)."""
-    import pyarrow as pa
-
-    points = np.empty(len(longitude), _WKB_POINT)
-    points["order"], points["kind"], points["x"], points["y"] = 1, 1, longitude.to_numpy(), latitude.to_numpy()
-    return pa.array([point.tobytes() for point in points], pa.binary())

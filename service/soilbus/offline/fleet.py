@@ -44,7 +44,7 @@ def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
     records: list[Record] = []
     for job in jobs:
         try:
-            with local_log(job) as path:
+            with local_log(job.log) as path:
                 read = recordings_of(config, database, [path], longest=LONGEST, partial=True).records
         except (LogError, TooLittle, OSError) as error:
             record["left_out"].append({"log": job.log, "fault": one_line(error, 200)})
@@ -72,15 +72,17 @@ def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
             "scope": scope[name],
             "probability": probability,
             "parameters": values_std(values.get(name, {})),
-            "onset": _onset(found.onsets[name], record["logs"]) if name in found.onsets else None,
+            "onset": _onset(found.onsets.get(name), record["logs"]),
         }
         for name, probability in found.probabilities.items()
     ]
     return record
 
 
-def _onset(onset: Onset, logs: Sequence[str]) -> dict[str, Any]:
+def _onset(onset: Onset | None, logs: Sequence[str]) -> dict[str, Any] | None:
     """The first log with an effect, and the size in each log alone."""
+    if onset is None:
+        return None
     by_log = zip(logs, onset.probabilities, onset.sizes, strict=True)
     return {
         "log": logs[onset.first],

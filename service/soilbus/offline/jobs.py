@@ -18,20 +18,18 @@ from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-from soilbus.can.log_formats import is_csv_of_frames
+from soilbus.can.log_formats import csv_of_frames
 from soilbus.config.model import Config
 from soilbus.files import opened, plain_bytes, read_all
 from soilbus.offline import dataset
 from soilbus.offline.cluster import BatchError
-from soilbus.offline.columns import MISSING_CELLS, check_cells, csv_rows
+from soilbus.offline.columns import MISSING_CELLS, PACKED, check_cells, csv_rows
 from soilbus.offline.parts import Job, Setup, file_name, kept_of, place_of, setup_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
 
 LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
 """Of logs in a folder; what a log is, its content tells."""
-PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zst")
-"""Each may stand behind one of a log."""
 TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
 MANIFEST_COLUMNS = ("log", "vehicle", "configuration", "start")
 
@@ -123,7 +121,7 @@ def _entries(argument: str, tables: bool) -> list[dict[str, str]]:
             return [{"log": argument}]
         raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
     if "log" not in header:
-        if tables or not header or is_csv_of_frames(",".join(header)):
+        if tables or not header or csv_of_frames(",".join(header)):
             return [{"log": argument}]
         raise BatchError(f"{argument}: a manifest needs a column log; its columns are {', '.join(header) or 'none'}")
     if not rows:
@@ -153,10 +151,12 @@ def _entry(manifest: str, number: int, row: Mapping[str, Any]) -> dict[str, str]
     folder, is_remote = place.rpartition("/")[0], "://" in manifest
     for name in ("log", "configuration"):
         text = texts.get(name)
-        if not text or "://" in text or (name == "configuration" and _is_machine(Path(manifest).parent / text)):
+        beside = Path(manifest).parent / (text or "")
+        is_machine = name == "configuration" and not beside.suffix and not beside.exists()
+        if not text or "://" in text or is_machine:
             continue
         if not is_remote:
-            texts[name] = str(Path(manifest).parent / text)
+            texts[name] = str(beside)
         elif name == "log":
             texts[name] = text if text.startswith("/") else f"{folder}/{text}" + (f"::{archive}" if archive else "")
         elif not text.startswith("/"):
@@ -170,11 +170,6 @@ def _cell(value: Any) -> str:
     if value is None or value != value:
         return ""
     return str(int(value) if isinstance(value, float) and value.is_integer() else value).strip()
-
-
-def _is_machine(configuration: Path) -> bool:
-    """Whether this can only be the name of a reference machine."""
-    return not configuration.suffix and not configuration.exists()
 
 
 def _csv_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, Any]]]]:
@@ -263,4 +258,4 @@ def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
 
 def _is_log(name: str, suffixes: Sequence[str]) -> bool:
     path = Path(name.lower())
-    return (path.with_suffix("") if path.suffix in PACKED_SUFFIXES else path).suffix in suffixes
+    return (path.with_suffix("") if path.suffix in PACKED else path).suffix in suffixes

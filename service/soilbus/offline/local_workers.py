@@ -18,8 +18,6 @@ from typing import Any
 from soilbus.allocator import keep_freed_memory
 from soilbus.workers import process_pool
 
-__all__ = ["KilledWorker", "LocalWorkers", "local_workers"]
-
 TRIES = 4
 """Processes that may die of a task before it is given up: those of Dask (distributed.scheduler.allowed-failures)."""
 LEAST_MEMORY = 2**30
@@ -46,10 +44,6 @@ class LocalWorkers:
     def nthreads(self) -> dict[str, int]:
         """Return the number of processes."""
         return {HERE: self._count}
-
-    def run(self, function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
-        """Return what a function returns here, where the processes see the same files."""
-        return {HERE: function(*arguments)}
 
     def get_executor(self, **_: Any) -> LocalWorkers:
         """Return this, which takes tasks."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -33,8 +33,6 @@ from soilbus.simulator.manoeuvre import Manoeuvre
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.wheel import Soil
-
-__all__ = ["Plan", "record_of_recording", "what_excites", "what_to_drive"]
 
 STEP = 4.0
 """Time [s] of a step: as long as a time block of the diagnosis, several windows' bins at every step."""
@@ -158,13 +156,13 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
     best = _best(config, score)
     if best is None:
         return None
-    found = _separations(diagnosis, config, best[0], true)
+    found = _separations(diagnosis, config, best, true)
     enough = (times for times in range(1, MAX_REPEATS + 1) if chance(found, times) >= DEFAULT.named_probability)
     separations = {
         name: {other: s for other, s in zip(names, row, strict=True) if other != name}
         for name, row in zip(names, found, strict=True)
     }
-    return Plan(best[0], names, separations, chance(found), next(enough, None))
+    return Plan(best, names, separations, chance(found), next(enough, None))
 
 
 def what_excites(config: Config, soil: Soil) -> tuple[Manoeuvre, Posterior] | None:
@@ -191,15 +189,12 @@ def what_excites(config: Config, soil: Soil) -> tuple[Manoeuvre, Posterior] | No
         return -sum(map(math.log, stds))
 
     found = _best(config, precision)
-    posterior = None if found is None else expected(found[0])
-    return None if found is None or posterior is None else (found[0], posterior)
+    posterior = None if found is None else expected(found)
+    return None if found is None or posterior is None else (found, posterior)
 
 
-def _best(config: Config, score: Callable[[Manoeuvre], float]) -> tuple[Manoeuvre, float] | None:
-    """The manoeuvre of the highest score, one column of its table after the other; None where none can be driven.
-
-    score: a logarithm of what is to be great; -inf where it cannot be driven.
-    """
+def _best(config: Config, score: Callable[[Manoeuvre], float]) -> Manoeuvre | None:
+    """The manoeuvre of the highest score, a logarithm, column after column; None where the best score is -inf."""
     columns = patterns(config.traversability.max_slip)
     chosen = {column: tried[0] for column, tried in columns.items()}
     best = score(_manoeuvre(chosen))
@@ -209,7 +204,7 @@ def _best(config: Config, score: Callable[[Manoeuvre], float]) -> tuple[Manoeuvr
             found = score(_manoeuvre(changed))
             if found > best + LEAST_GAIN:
                 best, chosen = found, changed
-    return (_manoeuvre(chosen), best) if np.isfinite(best) else None
+    return _manoeuvre(chosen) if np.isfinite(best) else None
 
 
 def _separations(
@@ -233,20 +228,13 @@ def _noise_free(config: Config, manoeuvre: Manoeuvre, truth: Truth) -> Observati
     scenario = manoeuvre.over(ground, config.tows_nothing)
     try:
         recording = simulate(silent, scenario, 0, truth.effects)
-        if recording.bogged_at is not None or _beyond_motors(recording, config):
+        true, wheels = recording.truth, [wheel.name for wheel in config.wheel]
+        beyond_motors = any(bool(np.any(true[f"torque.{w}"] > true[f"torque_limit.{w}"])) for w in wheels)
+        if recording.bogged_at is not None or beyond_motors:
             return None
         return record_of_recording("manoeuvre", recording, config).whole
     except (SimulationError, TooLittle):
         return None
-
-
-def _beyond_motors(recording: Recording, config: Config) -> bool:
-    """Whether a torque exceeds its motor's limit, where that is known."""
-    pairs: Iterator[tuple[Any, Any]] = (
-        (recording.truth[f"torque.{wheel.name}"], recording.truth[f"torque_limit.{wheel.name}"])
-        for wheel in config.wheel
-    )
-    return any(bool(np.any(torque > limit)) for torque, limit in pairs)
 
 
 def record_of_recording(name: str, recording: Recording, config: Config) -> Record:

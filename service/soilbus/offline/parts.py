@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from io import SEEK_END
@@ -32,7 +32,7 @@ from cantools.database.can import Database
 from soilbus import __version__
 from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.config.file import located
-from soilbus.config.model import Config, ConfigError
+from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
 from soilbus.export.table import arrow_table, joined, parquet_bytes
@@ -75,16 +75,13 @@ class Setup:
 class Job:
     """A log to replay: absolute path or URL, the vehicle that recorded it, and this one's configuration.
 
-    `start` is the time [s] of the first sample, for logs whose stamps are no dates. Where workers do not see the file,
-    `content` is the log itself, or `not_sent` says in one line why it was not sent along.
+    `start` is the time [s] of the first sample, for logs whose stamps are no dates.
     """
 
     log: str
     vehicle: str
     setup: Setup
     start: float | None = None
-    content: bytes | None = field(default=None, repr=False)
-    not_sent: str | None = field(default=None, repr=False)
 
     @property
     def digest(self) -> str:
@@ -95,18 +92,24 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of a log: why it was not read, or not to its end, in one line; summary and Parquet file of its windows.
+    """Result of a log: why it was not read, or not to its end, in one line; summary and bytes of its part.
 
     `other_bus`: no frame of it is in the DBC. `lasting`: the fault is of what is in the log, so that the same file has
-    it again; else of the place or machine. `size` is that of the log in bytes.
+    it again; else of the place or machine. The log has this `size` in bytes and, where that is known, was `changed` at
+    this time [ns].
     """
 
     fault: str | None
     summary: dict[str, Any] | None = None
-    part: bytes = b""
+    part_bytes: int = 0
     other_bus: bool = False
     lasting: bool = False
     size: int = 0
+    changed: int | None = None
+
+    def is_of(self, size: int | None, changed: int | None) -> bool:
+        """Return whether a file in this state is still the same, as far as its state is known."""
+        return size in (self.size, None) and (changed == self.changed or None in (changed, self.changed))
 
 
 def setup_of(config: Config, name: str) -> Setup:
@@ -114,32 +117,14 @@ def setup_of(config: Config, name: str) -> Setup:
     digest = hashlib.sha256((config.model_dump_json() + (config.log_channel or "")).encode())
     database = None
     if config.table is None:
-        with TemporaryDirectory(prefix="soilbus-") as folder:
-            here = _with_dbcs_here(config, Path(folder))
-            database = load_databases(here)
-            for dbc in here.dbc.input:
-                digest.update(hashlib.sha256(located(here.folder, dbc).read_bytes()).digest())
-            # a worker has none of these files: what it needs of them is the database, and the names of what is checked
-            config = _with_dbc(config, input=[], checked=sorted(checked_messages(here, database)))
+        database = load_databases(config)
+        for dbc in config.dbc.input:
+            digest.update(hashlib.sha256(located(config.folder, dbc).read_bytes()).digest())
+        # a worker has none of these files: what it needs of them is the database, and the names of what is checked
+        of_dbc = {"input": [], "checked": sorted(checked_messages(config, database))}
+        config = config.model_copy(update={"dbc": config.dbc.model_copy(update=of_dbc)})
         Pipeline(config, database)
     return Setup(name, pickle.dumps((config, database)), digest.hexdigest())
-
-
-def _with_dbc(config: Config, **settings: list[str]) -> Config:
-    return config.model_copy(update={"dbc": config.dbc.model_copy(update=settings)})
-
-
-def _with_dbcs_here(config: Config, folder: Path) -> Config:
-    """The configuration with copies, in the folder, of the DBC files that it names by URL."""
-    paths = []
-    for n, name in enumerate(config.dbc.input):
-        paths.append(name)
-        if "://" in name:
-            try:
-                paths[-1] = str(_fetched(name, folder / str(n)))
-            except LogError as error:
-                raise ConfigError([f"dbc.input: {error}"]) from None
-    return _with_dbc(config, input=paths)
 
 
 def place_of(log: str) -> str:
@@ -156,11 +141,10 @@ def file_name(log: str) -> str:
 
 
 def _fetched(url: str, folder: Path) -> Path:
-    """Copy of the file at a URL, in a folder that is made; LogError where there is none."""
+    """Copy of the file at a URL; LogError where there is none."""
     from fsspec.core import url_to_fs
 
     path = folder / file_name(url)
-    folder.mkdir(exist_ok=True)
     try:
         files, name = url_to_fs(url)
         files.get_file(name, str(path))
@@ -177,58 +161,41 @@ def unpacked(content: bytes) -> tuple[Config, Database | None]:
     return config, database
 
 
-def part_of(job: Job) -> Outcome:
-    """Replay one log; a fault of the log is in the outcome."""
-    size = 0
+def part_of(job: Job) -> tuple[Outcome, bytes]:
+    """Replay one log and return its outcome, which says its faults, and its part."""
+    size, part = 0, b""
     try:
-        with local_log(job) as path:
-            _check_is_file(path)
+        with local_log(job.log) as path:
+            mode = path.stat().st_mode
+            if stat.S_ISDIR(mode):
+                unread = "" if os.access(path, os.R_OK | os.X_OK) else " that cannot be read"
+                raise LogError(f"{path}: a folder{unread}")
+            if not stat.S_ISREG(mode):  # a pipe or device may have no end
+                raise LogError(f"{path}: not a regular file")
             with path.open("rb") as log:
                 size = log.seek(0, SEEK_END)
-            outcome = _replayed(job, path, time.thread_time() + CPU_FREE + CPU_PER_BYTE * size)
+            outcome, part = _replayed(job, path, time.thread_time() + CPU_FREE + CPU_PER_BYTE * size)
     except LogError as error:
-        return Outcome(str(error))
+        outcome = Outcome(str(error))
     except MemoryError:
-        return Outcome(f"{job.log}: not enough memory")
+        outcome = Outcome(f"{job.log}: not enough memory")
     except OSError as error:
         why = MISSING if isinstance(error, FileNotFoundError) else error.strerror or one_line(error, 200)
-        return Outcome(f"{job.log}: {why}")
+        outcome = Outcome(f"{job.log}: {why}")
     except Exception as error:  # a defect of ours, or of a library on a file that it never met
-        return Outcome(f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True, size=size)
-    return replace(outcome, size=size)
-
-
-def _check_is_file(path: Path) -> None:
-    """LogError where it is a folder, or a pipe or device, which may have no end."""
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        raise LogError(f"{path}: a folder" + ("" if os.access(path, os.R_OK | os.X_OK) else " that cannot be read"))
-    if not stat.S_ISREG(mode):
-        raise LogError(f"{path}: not a regular file")
+        outcome = Outcome(f"{job.log}: {one_line(error, 200)} ({type(error).__name__})", lasting=True)
+    return replace(outcome, part_bytes=len(part), size=size), part
 
 
 @contextmanager
-def local_log(job: Job) -> Iterator[Path]:
-    """Give the path of the log on this machine, for as long as the context lasts.
-
-    LogError where the URL cannot be read, or the log is neither here nor was it sent along.
-    """
-    if job.content is None and "://" not in job.log:
-        if job.not_sent is not None and not Path(job.log).exists():
-            raise LogError(job.not_sent)
-        yield Path(job.log)
-        return
+def local_log(log: str) -> Iterator[Path]:
+    """Give the path of a log on this machine, for as long as the context lasts; LogError for a URL without one."""
     with TemporaryDirectory(prefix="soilbus-") as folder:
-        if job.content is None:
-            yield _fetched(job.log, Path(folder))
-            return
-        path = Path(folder, job.log.rpartition("/")[2])
-        path.write_bytes(job.content)
-        yield path
+        yield _fetched(log, Path(folder)) if "://" in log else Path(log)
 
 
-def _replayed(job: Job, path: Path, latest: float) -> Outcome:
-    """The outcome; when the thread's clock says `latest` [s] the log is given up."""
+def _replayed(job: Job, path: Path, latest: float) -> tuple[Outcome, bytes]:
+    """Outcome and part; when the thread's clock says `latest` [s] the log is given up."""
     config, database = unpacked(job.setup.content)
     fault, shift, window = None, 0.0, config.estimator.window
     pipeline = None if database is None else Pipeline(config, database)
@@ -251,10 +218,11 @@ def _replayed(job: Job, path: Path, latest: float) -> Outcome:
     text = None if fault is None else str(fault).replace(str(path), job.log)
     if tables or rows:
         table = joined([*tables, arrow_table(rows)])
-        return Outcome(text, _summary(table, job, config, pipeline, text), parquet_bytes(table), lasting=bool(fault))
+        summary = _summary(table, job, config, pipeline, text)
+        return Outcome(text, summary, lasting=bool(fault)), parquet_bytes(table)
     if fault is not None:
-        return Outcome(text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting)
-    return Outcome(f"{job.log}: no recording in it lasts the {window:g} s of a window", lasting=True)
+        return Outcome(text, other_bus=isinstance(fault, OtherBus), lasting=fault.lasting), b""
+    return Outcome(f"{job.log}: no recording in it lasts the {window:g} s of a window", lasting=True), b""
 
 
 def _row(result: WindowResult, job: Job, config: Config, shift: float) -> dict[str, Any]:
@@ -306,34 +274,15 @@ def _summary(table: Any, job: Job, config: Config, pipeline: Pipeline | None, fa
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Kept:
-    """What came of a log, as in an Outcome, with the bytes of its part and the state of its file.
-
-    Of the log it has the size and, where that is known, the time of change [ns].
-    """
-
-    fault: str | None
-    summary: dict[str, Any] | None
-    part_bytes: int
-    other_bus: bool
-    size: int
-    changed: int | None
-
-    def is_of(self, size: int | None, changed: int | None) -> bool:
-        """Return whether a file in this state is still the same, as far as its state is known."""
-        return size in (self.size, None) and (changed == self.changed or None in (changed, self.changed))
-
-
 def part_path(parts: Path, digest: str) -> Path:
     """Return where the windows of a log are."""
     return parts / f"{digest}.parquet"
 
 
-def kept_of(parts: Path, digest: str) -> Kept | None:
+def kept_of(parts: Path, digest: str) -> Outcome | None:
     """Return what is kept of a log; None where it is not whole."""
     try:
-        kept = Kept(**json.loads(read_bounded(parts / f"{digest}.json", LIMITS.whole)))
+        kept = Outcome(**json.loads(read_bounded(parts / f"{digest}.json", LIMITS.whole)))
         is_whole = not kept.part_bytes or part_path(parts, digest).stat().st_size == kept.part_bytes
     except (OSError, ValueError, TypeError):
         return None

@@ -1,4 +1,4 @@
-"""A recording played to the live service: a bus and a clock that follow the frames' stamps.
+"""A recording played to the live service or to the dashboard: a bus and a clock that follow the frames' stamps.
 
     now = now at the last frame + (its stamp - the last one's)    time passes only while somebody waits
 
@@ -8,6 +8,7 @@ Stamps that go back take no time, and a silence takes LONGEST_GAP at most, after
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from typing import Any
@@ -23,10 +24,11 @@ LEAST_WAIT = 1e-4
 
 
 class PlayedClock:
-    """Monotonic time [s] that passes only when somebody waits."""
+    """Monotonic time [s] that passes only when somebody waits, at most `speed` times as fast as real time."""
 
-    def __init__(self) -> None:
-        self.now = 1000.0
+    def __init__(self, speed: float = math.inf) -> None:
+        self.now = self._begin = 1000.0
+        self._speed, self._began = speed, time.monotonic()
 
     def __call__(self) -> float:
         return self.now
@@ -34,6 +36,8 @@ class PlayedClock:
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
         self.now += max(seconds, 0.0)
+        if math.isfinite(self._speed):
+            time.sleep(max(self._began + (self.now - self._begin) / self._speed - time.monotonic(), 0.0))
 
     def wait_for(self, future: Future[Any], longest: float) -> None:
         """Let the time `longest` [s] pass, unless the future is done."""
@@ -60,8 +64,10 @@ class PlayedBus:
     The clock goes on with the frames; what is sent has the name of the channel.
     """
 
+    fault = ""
+
     def __init__(
-        self, frames: Iterator[Frame], filters: Sequence[dict[str, Any]], clock: PlayedClock, channel: str
+        self, frames: Iterator[Frame], filters: Sequence[dict[str, Any]], clock: PlayedClock, channel: str = ""
     ) -> None:
         self._frames, self._filters, self._clock, self._channel = frames, filters, clock, channel
         self._passes: dict[tuple[int, bool], bool] = {}
@@ -81,10 +87,12 @@ class PlayedBus:
             self._clock.sleep(max(longest, LEAST_WAIT))
             return None
         frame = self._next
-        self._clock.now = max(now, due)
+        self._clock.sleep(due - now)
         self._stamp, self._taken_at = frame.timestamp, self._clock.now
         self._next = self._following()
         return frame
+
+    receive = recv
 
     def send(self, message: can.Message) -> None:
         """Keep a frame, stamped with the bus's time."""

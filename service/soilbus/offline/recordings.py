@@ -11,7 +11,7 @@ import math
 import os
 import stat
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,28 +93,20 @@ def check_different(logs: Sequence[Path]) -> None:
     Files that differ in size are not read.
     """
     known = [(log, log.stat()) for log in logs if os.path.exists(log)]
-    _check_unlike((log, (status.st_dev, status.st_ino)) for log, status in known)
     sizes = Counter(status.st_size for _, status in known)
-    _check_unlike(
-        (log, _digest(log)) for log, status in known if stat.S_ISREG(status.st_mode) and sizes[status.st_size] > 1
-    )
-
-
-def _check_unlike(logs: Iterable[tuple[Path, Hashable]]) -> None:
-    """Refuse two logs that have the same mark."""
     first: dict[Hashable, Path] = {}
-    for log, mark in logs:
-        if mark in first:
-            raise LogError(f"{first[mark]} and {log} are the same recording, which counts once: leave one out")
-        first[mark] = log
-
-
-def _digest(log: Path) -> bytes:
-    try:
-        with log.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").digest()
-    except OSError as error:
-        raise LogError(f"{log}: {error.strerror}") from None
+    for log, status in known:
+        marks: list[Hashable] = [(status.st_dev, status.st_ino)]
+        if stat.S_ISREG(status.st_mode) and sizes[status.st_size] > 1:
+            try:
+                with log.open("rb") as file:
+                    marks.append(hashlib.file_digest(file, "sha256").digest())
+            except OSError as error:
+                raise LogError(f"{log}: {error.strerror}") from None
+        for mark in marks:
+            if mark in first:
+                raise LogError(f"{first[mark]} and {log} are the same recording, which counts once: leave one out")
+            first[mark] = log
 
 
 def parts(

@@ -23,9 +23,10 @@ import can
 
 from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.candump import Frame
+from soilbus.can.columns import mapped_columns
 from soilbus.can.logs import Log, LogError, OtherBus, read_frames
 from soilbus.config.model import Config
-from soilbus.offline.columns import SignalTable, signal_table
+from soilbus.offline.columns import SignalTable
 from soilbus.pipeline.estimator import Undecided, WindowEstimator
 from soilbus.pipeline.intake import Intake, WindowTask
 from soilbus.pipeline.pipeline import Pipeline
@@ -41,9 +42,9 @@ MAX_PENDING_WINDOWS = 30
 """Windows that may wait for the estimator."""
 
 
-def read_log(path: Path, channel: str = "") -> Iterator[can.Message]:
+def read_log(path: Path) -> Iterator[can.Message]:
     """Yield the frames of read_frames() as messages of python-can."""
-    for t, identifier, extended, data, remote, error in read_frames(path, channel):
+    for t, identifier, extended, data, remote, error in read_frames(path):
         yield can.Message(
             timestamp=t, arbitration_id=identifier, is_extended_id=extended, data=data, is_remote_frame=remote,
             is_error_frame=error, is_fd=len(data) > 8,
@@ -121,29 +122,19 @@ def _tasks(
     """The windows of every log with its name."""
     for path, name in zip(logs, log_names(logs), strict=True):
         pipeline.begin_recording()
-        n = 0
+        intake, before = pipeline.intake, pipeline.intake.ended
+        fault: LogError | None = None
         try:
-            for task in _windows(pipeline.intake, path, progress):
-                n += 1
-                yield name, task
+            for now in fed(intake, path, progress):
+                yield from ((name, task) for task in intake.due(now))
         except LogError as error:
-            error.windows = n
+            fault = error
+        yield from ((name, task) for task in intake.finish(intake.admission.newest))
+        if fault is not None:
+            fault.windows = intake.ended - before
             if on_fault is None:
-                raise
-            on_fault(error)
-
-
-def _windows(intake: Intake, log: Path, progress: Callable[[int, float], None] | None) -> Iterator[WindowTask]:
-    """The windows of one log; LogError after those before the place where it is damaged."""
-    fault: LogError | None = None
-    try:
-        for now in fed(intake, log, progress):
-            yield from intake.due(now)
-    except LogError as error:
-        fault = error
-    yield from intake.finish(intake.admission.newest)
-    if fault is not None:
-        raise fault
+                raise fault
+            on_fault(fault)
 
 
 def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
@@ -242,5 +233,5 @@ def channel_notes(config: Config, logs: Iterable[Path]) -> list[str]:
 def log_of(config: Config, path: Path) -> Log | SignalTable:
     """Return the log of the configured channel, or with [columns] the table of signals."""
     if config.columns is not None:
-        return signal_table(config, path)
+        return SignalTable(path, config.columns, list(mapped_columns(config)))
     return Log(path, config.log_channel or config.bus.channel, demanded=config.log_channel is not None)

@@ -10,6 +10,7 @@ recording are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import can
@@ -27,8 +28,6 @@ from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 
-__all__ = ["sent_beside", "sent_frames"]
-
 
 def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
     """Yield the frames that the service sends while each log is on its bus, stamped with the recording's time [s].
@@ -36,8 +35,13 @@ def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
     It begins again with each log; one that is damaged ends where it is. ConfigError where the configuration cannot
     work, or a frame would come less often than its DBC says.
     """
+
+    def readable(log: Path) -> Iterator[Frame]:
+        with suppress(LogError):
+            yield from log_of(config, log).frames()
+
     for log in logs:
-        yield from sent_beside(config, _readable(config, log))
+        yield from sent_beside(config, readable(log))
 
 
 def sent_beside(
@@ -59,11 +63,3 @@ def sent_beside(
     while not played.is_empty:
         service.step()
         yield from played.take_sent()
-
-
-def _readable(config: Config, log: Path) -> Iterator[Frame]:
-    """The frames before the place where a log is damaged."""
-    try:
-        yield from log_of(config, log).frames()
-    except LogError:
-        return

@@ -87,7 +87,8 @@ def _table_of(config: Config, source: str) -> Table:
 def _runs(config: Config, columns: Columns, source: str, name: str) -> list[Run]:
     """The runs of the needed columns of a table; `source` stands in messages, `name` in the runs' names."""
     table = _table_of(config, source)
-    chosen = _chosen(columns, table.where)
+    n = len(next(iter(columns.values())))
+    chosen = [i for i in range(n) if all(_equal(columns[name][i], wanted) for name, wanted in table.where.items())]
     if not chosen:
         raise TableError(f"{source}: no row in it" + (" that [table] where asks for" if table.where else ""))
     values = {role: _numbers(source, columns, column, chosen) for role, column in table.columns.items()}
@@ -218,12 +219,6 @@ def _needed(table: Table) -> list[str]:
     """Names of the columns that must be there."""
     mapped = [column.column for column in table.columns.values()]
     return list(dict.fromkeys([*mapped, *([table.run] if table.run else []), *table.where]))
-
-
-def _chosen(columns: Columns, where: Mapping[str, Any]) -> list[int]:
-    """Numbers of the rows that `where` asks for."""
-    n = len(next(iter(columns.values())))
-    return [i for i in range(n) if all(_equal(columns[name][i], wanted) for name, wanted in where.items())]
 
 
 def _equal(cell: Any, wanted: Any) -> bool:

@@ -17,8 +17,6 @@ from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 
-__all__ = ["NO_CORRECTIONS", "Corrections"]
-
 
 @dataclass(frozen=True, slots=True)
 class Corrections:

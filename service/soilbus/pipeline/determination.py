@@ -28,16 +28,6 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.terra.vehicle import GRAVITY, slip_ratio
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, sinkage
 
-__all__ = [
-    "Excitation",
-    "contact_pressure",
-    "draft_is_known",
-    "excitation_of",
-    "lacking",
-    "loaded_depths",
-    "sinkage_range",
-]
-
 LEAST_DRAFT = 0.1
 """Draft [1], over the weight, below which a relative error says little: a machine that can pull nothing is known as
 well as one that can.  A tenth is what wheels resist on soft fields (0.05 to 0.1, Wong 2008, fig. 2.60)."""
@@ -84,10 +74,10 @@ def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
     posterior = fit.posterior
     low, high = loaded_depths(fit, rig)
     bearing = posterior.bearing_pressure(min(max(settings.z_ref, low), high), settings.b_ref)
-    lacks = ["load_range"] if _is_wide(bearing, settings.max_bearing_std) else []
+    lacks = ["load_range"] if is_wide(bearing, settings.max_bearing_std) else []
     if rig.chassis is None:
         sheared = posterior.tan_phi(), posterior.shear_strength(contact_pressure(fit, rig))
-        lacks += ["slip_range"] * all(_is_wide(e, settings.max_tan_phi_std) for e in sheared)
+        lacks += ["slip_range"] * all(is_wide(e, settings.max_tan_phi_std) for e in sheared)
     return lacks
 
 
@@ -128,5 +118,6 @@ def contact_pressure(fit: Fit, rig: Rig) -> float:
     return float(np.nanmedian(latents.load / (rig.width * length)))
 
 
-def _is_wide(estimate: Estimate, most: float) -> bool:
+def is_wide(estimate: Estimate, most: float) -> bool:
+    """Return whether the standard deviation is more than this share of the value."""
     return estimate.std > most * estimate.value

@@ -42,12 +42,15 @@ from soilbus.estimation.standing import STANDING, wheel_inertia
 from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput
 from soilbus.estimation.window import Rig, Window, steady
 from soilbus.pipeline.corrections import Corrections
-from soilbus.pipeline.determination import draft_is_known, excitation_of, lacking, sinkage_range
+from soilbus.pipeline.determination import draft_is_known, excitation_of, is_wide, lacking, sinkage_range
 from soilbus.pipeline.intake import WindowTask, input_rejected
 from soilbus.pipeline.model_gap import SPAN, PredictionWatch, Sums, squares
 from soilbus.pipeline.result import SoilChange, WindowResult, as_of
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.effects.steady import CompletedModel
+
+UNSETTLED = (TrackerState.SUSPECT, TrackerState.TRANSITION)
+"""States in which a window is not of the present soil alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +131,8 @@ class WindowEstimator:
         self._tracker_of = partial(tracker_of, prior=self.prior, model=self.model, settings=of_tracker)
         self._apart, self._engaged_at = np.zeros(len(self.rig.wheels), bool), -math.inf
         self._driven_rig = self.rig
-        self._tracker = self._new_tracker()
-
-    @property
-    def tracker(self) -> Tracker:
+        self.tracker = self._new_tracker()
         """The tracker, which carries soil and gains from window to window."""
-        return self._tracker
 
     def _new_tracker(self) -> Tracker:
         effects, free = self._effects_and_parameters
@@ -146,9 +145,9 @@ class WindowEstimator:
         if (apart != self._apart).any():
             self._apart, self._engaged_at = apart, since
             self._driven_rig = with_disengaged(self.config, self.rig, apart)
-            before, self._tracker = self._tracker, self._new_tracker()
+            before, self.tracker = self.tracker, self._new_tracker()
             self._gain_names, self._gain_std = gains_of(self._driven_rig)
-            self._tracker.start_from(before, since)
+            self.tracker.start_from(before, since)
             self._predictions = PredictionWatch(self._settings.window)
         window = task.window
         if len(window.t) and window.t[0] <= self._engaged_at:
@@ -166,9 +165,9 @@ class WindowEstimator:
     def estimate(self, task: WindowTask) -> Undecided:
         """Return soil and status of one window; windows in their order."""
         if task.fresh:
-            self._tracker.reset()
+            self.tracker.reset()
             self._engaged_at = -math.inf
-        tracked = self._tracker.estimate(self._follow_clutch(task), task.end)
+        tracked = self.tracker.estimate(self._follow_clutch(task), task.end)
         fit = tracked.fit
         self._watch_model(task, tracked)
         status, reason = self._status(task, tracked)
@@ -176,18 +175,20 @@ class WindowEstimator:
         if fit is not None and status is not Status.INVALID:
             own = posterior = fit.mode.posterior
             if fit.form is not None:
-                prior = self._tracker.soil_prior
+                prior = self.tracker.soil_prior
                 posterior = own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
-        basis = self._basis(task, fit)
+        basis, settings = self._basis(task, fit), self._settings
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
+        change = None if tracked.change is None else tracked.change.statistic
+        limits = (None, None) if change is None else (change.ratio, change.threshold)
         result = WindowResult(
             t=task.end,
             index=task.index,
             status=status,
             reason=reason,
             posterior=posterior,
-            bearing=None if posterior is None else self._bearing(posterior),
+            bearing=None if posterior is None else posterior.bearing_pressure(settings.z_ref, settings.b_ref),
             slip=task.slip,
             sinkage=self._sinkage(fit if posterior is not None else None),
             traversability=Traversability(),
@@ -199,30 +200,30 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
-            gaps=self._predictions.gaps(self._settings.max_prediction_error),
+            gaps=self._predictions.gaps(settings.max_prediction_error),
             prediction_error=self._predictions.shares(),
             standing=self._standing(fit),
-            noise_factors={kind: math.sqrt(f) for kind, f in self._tracker.components.factor.items()},
+            noise_factors={kind: math.sqrt(f) for kind, f in self.tracker.components.factor.items()},
             channel_chi2=self._gap.ratios(),
-            excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
+            excitation=excitation_of(task.window, self.rig, settings.min_speed),
             basis=basis,
             z_driven=None if fit is None or posterior is None else sinkage_range(fit, self._driven_rig),
             search_ended=tracked.search_ended,
-            soil_change=_soil_change(tracked),
-            shows_strength=fit is not None and self._shows_strength(fit),
+            soil_change=SoilChange(str(tracked.state), str(tracked.reason), *limits),
+            shows_strength=fit is not None and not is_wide(fit.mode.posterior.tan_phi(), settings.max_tan_phi_std),
         )
-        effects = self._effects(fit)
+        active, free = self._effects_and_parameters
+        standardised = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
+        effects = active_at(active, free, standardised, len(self.rig.wheels))
         model = self._present_model(task.window, tracked, effects)
         window = Corrections(effects=effects).corrected(steady(task.window), self.rig)
         rig = self._as_driven(tracked, window)
-        demand = present_demand(window, rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
+        demand = present_demand(window, rig.chassis, self._settings.hop, self._gain(tracked, "draft"))
+        here = tracked.state not in UNSETTLED
         corrections = Corrections(self._torque_ceiling(task, window), effects)
-        result, limit = (
-            replace(result, corrections=corrections),
-            corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig)),
-        )
+        limit = corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig))
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
+        result = replace(result, corrections=corrections)
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
     def decide(self, window: Undecided) -> WindowResult:
@@ -270,10 +271,7 @@ class WindowEstimator:
         """Corrections.torque_ceiling; window: the task's, with its draft corrected."""
         hop, deviations = self._settings.hop, self.config.traversability.contradiction
         if task.fresh:
-            self._idle, self._ceiling = (
-                np.zeros(len(self.rig.wheels), bool),
-                TorqueCeiling.unknown(len(self.rig.wheels)),
-            )
+            self._idle, self._ceiling = np.zeros_like(self._idle), TorqueCeiling.unknown(len(self._idle))
         self._idle = idle(task.window, self.rig, task.end - hop, self._idle)
         self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
         measured = np.where(np.isfinite(self._ceiling.limit), self._ceiling.limit, np.inf)
@@ -302,39 +300,26 @@ class WindowEstimator:
             self._watch = watched(self._watch, moment, known, self.config)
             self._warnings = self._warnings.after(moment.t, self._watch.warning)
 
-    def _effects(self, fit: Fit | None) -> list[Active]:
-        """The effects with their fitted parameters, or without a fit as configured."""
-        effects, free = self._effects_and_parameters
-        standardised = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
-        return active_at(effects, free, standardised, len(self.rig.wheels))
-
     def _present_model(self, window: Window, tracked: TrackerOutput, effects: Sequence[Active]) -> UncertainModel:
         """The model for the decision, at the window's usual speed."""
-        speed, fit = self._usual_speed(window), tracked.fit
+        moving, fit = window.ground_speed[window.ground_speed > self._settings.min_speed], tracked.fit
+        speed = float(moving.mean()) if len(moving) else self._settings.min_speed
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         return UncertainModel.of(
             self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, fit.form
         )
 
-    def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
-        """Gain error of the draft sensor: posterior of the fit, else the prior."""
-        return self._gain(tracked, "draft")
-
     def _as_driven(self, tracked: TrackerOutput, window: Window) -> Rig:
-        """The rig with its estimated mass, and where the window ends in reverse with its chassis so."""
-        rig = self._with_estimated_mass(tracked)
-        if rig.chassis is None or not (window.direction[-1:] < 0.0).any():
+        """The rig with the mass that a window without load cells estimates, in reverse where the window ends so."""
+        rig, chassis = self._driven_rig, self.rig.chassis
+        if chassis is None:
             return rig
-        return replace(rig, chassis=rig.chassis.in_reverse)
-
-    def _with_estimated_mass(self, tracked: TrackerOutput) -> Rig:
-        """The rig with the mass m / (1 + gain of the weight) that the window estimates, where no load cell does."""
-        if self.rig.chassis is None or MASS_GAIN not in self._gain_names:
-            return self._driven_rig
-        error = self._gain(tracked, MASS_GAIN)
-        chassis = replace(self.rig.chassis, mass=self.rig.chassis.mass / (1.0 + error.value))
-        return replace(self._driven_rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
+        if MASS_GAIN in self._gain_names:
+            error = self._gain(tracked, MASS_GAIN)
+            chassis = replace(chassis, mass=chassis.mass / (1.0 + error.value))
+            rig = replace(rig, chassis=chassis, mass_std=error.std / (1.0 + error.value))
+        return replace(rig, chassis=chassis.in_reverse) if (window.direction[-1:] < 0.0).any() else rig
 
     def _gain(self, tracked: TrackerOutput, name: str) -> Estimate:
         """A sensor's or row's gain error: posterior of the fit, else the prior."""
@@ -355,13 +340,10 @@ class WindowEstimator:
             if gain.std > 0.0
         }
 
-    def _bearing(self, posterior: Posterior) -> Estimate:
-        return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
-
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
             return None
-        soil_prior = self._tracker.soil_prior
+        soil_prior = self.tracker.soil_prior
         return self._classes.probabilities(posterior, self._class_prior if soil_prior is self.prior else soil_prior)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
@@ -370,14 +352,9 @@ class WindowEstimator:
         known = zip(self.rig.wheels, fit.sinkage.tolist(), strict=True)
         return {wheel: z if math.isfinite(z) else None for wheel, z in known}
 
-    def _usual_speed(self, window: Window) -> float:
-        """Mean ground speed [m/s] while the vehicle moves; min_speed where it does not."""
-        moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
-        return float(moving.mean()) if len(moving) else self._settings.min_speed
-
     def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
         """The instants of a fit, and the distance driven since the last of them."""
-        instants, each = np.empty(0) if fit is None else fit.optimum.t, self._tracker.instant or self._settings.bin
+        instants, each = np.empty(0) if fit is None else fit.optimum.t, self.tracker.instant or self._settings.bin
         end = min(instants[-1] + each / 2.0, task.end) if len(instants) else -math.inf
         since = task.window.ground_speed[task.window.t > end]
         known = since[np.isfinite(since)]
@@ -407,47 +384,25 @@ class WindowEstimator:
             return Status.INVALID, "no_convergence"
         if fit is None or not fit.converged:
             return Status.INVALID, self._mismatch
-        if tracked.mismatch or self._contradicts(fit):
+        sensors, settings = np.asarray(self._gain_std), self._settings
+        far = np.abs(fit.gains[: len(sensors)]) > settings.max_gain_error * sensors  # from what is configured of them
+        if tracked.mismatch or far.any() or self._predictions.error() > settings.max_prediction_error:
             return Status.DEGRADED, self._mismatch
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        if self._too_little_of_new_soil(tracked, task.end):
+        enough = self.config.traversability.min_share * self._settings.window
+        if tracked.state in UNSETTLED or tracked.since > task.end - enough:
             return Status.NOT_EXCITED, "not_excited new_soil"
         if lacks := lacking(fit, self._driven_rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
-
-    def _contradicts(self, fit: Fit) -> bool:
-        """Whether new data are far from their prediction, or a sensor's gain is far from what is configured of it."""
-        sensors = np.asarray(self._gain_std)
-        gains = np.abs(fit.gains[: len(sensors)])
-        too_far = bool((gains > self._settings.max_gain_error * sensors).any())
-        return too_far or self._predictions.error() > self._settings.max_prediction_error
-
-    def _shows_strength(self, fit: Fit) -> bool:
-        """Whether the window determines tan phi."""
-        tan_phi = fit.mode.posterior.tan_phi()
-        return tan_phi.std <= self._settings.max_tan_phi_std * tan_phi.value
-
-    def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
-        """Whether too little of the window is on the new soil."""
-        if tracked.state in (TrackerState.SUSPECT, TrackerState.TRANSITION):
-            return True
-        return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
     def _failure(self, tracked: TrackerOutput) -> str | None:
         """Kind of failure of a solve: not_finite or no_convergence; None for none."""
         fit = tracked.fit
         if fit is None:
             return "not_finite" if tracked.mismatch and not tracked.search_ended else None
-        return None if fit.converged or self._tracker.is_of_several_soils(fit) else "no_convergence"
-
-
-def _soil_change(tracked: TrackerOutput) -> SoilChange:
-    """Which soil a window is of, and why."""
-    change = None if tracked.change is None else tracked.change.statistic
-    limits = (None, None) if change is None else (change.ratio, change.threshold)
-    return SoilChange(str(tracked.state), str(tracked.reason), *limits)
+        return None if fit.converged or self.tracker.is_of_several_soils(fit) else "no_convergence"
 
 
 def _gated(tracked: TrackerOutput) -> str:

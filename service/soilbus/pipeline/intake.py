@@ -124,17 +124,16 @@ class Refusals:
         """Count what was used and refused of one batch of frames."""
         self.used += sum(len(column.t) for column in decoded.columns.values())
         for (_, reason), times in decoded.refused.items():
-            self.note(str(reason), times)
+            self._note(str(reason), times)
         for reason, n in decoded.untimed.items():
             self.total[str(reason)] += n
 
     def note_outliers(self, times: Array) -> None:
         """Count samples as refused that were counted as used before they were found to be outliers."""
-        self.note(OUTLIER, times)
+        self._note(OUTLIER, times)
         self.used -= len(times)
 
-    def note(self, reason: str, times: Array) -> None:
-        """Count samples refused for one reason at these times [s], ascending."""
+    def _note(self, reason: str, times: Array) -> None:
         if len(times):
             self.entries.append((reason, times))
             self.total[reason] += len(times)
@@ -245,9 +244,9 @@ class Intake:
         self._latest = max([0.0, *late.values()])
         self._waits = {name: self._latest - delay for name, delay in late.items() if self._latest != delay}
         self._settings = config.estimator
-        self._decision = config.traversability
         self._limits = ReportedLimits(motors_of(config, self.rig), options.limit_samples)
-        self._index = 0
+        self.ended = 0
+        """Windows that have ended since the start, and restarts of the clock."""
         self.epoch = 0
         self._silent_hops = LONGEST_GAP / config.estimator.hop  # that may still end windows
         self._ready: list[WindowTask] = []
@@ -258,7 +257,7 @@ class Intake:
     def of_another_recording(self) -> Intake:
         """Return a new intake without data, which continues the counts of windows, frames and refusals."""
         other = Intake(self.config, self._database, self._delays, self._options)
-        other.admission.counts, other._index = self.admission.counts, self._index
+        other.admission.counts, other.ended = self.admission.counts, self.ended
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
         return other
 
@@ -303,12 +302,14 @@ class Intake:
     def add(self, decoded: Decoded) -> None:
         """Put decoded samples into bins; `ingest` calls it with the received frames."""
         self.refusals.add(decoded)
-        if (times := _times(decoded)) is not None:
-            first, last = times
-            self._newest = max(self._newest, last)
+        ends = [(c.t[0], c.t[-1]) for c in decoded.columns.values() if len(c.t)]
+        ends += [(known.min(), known.max()) for t in decoded.refused.values() if len(known := t[np.isfinite(t)])]
+        if ends:
+            self._newest = max(self._newest, *(float(last) for _, last in ends))
             if self._bins is None:
-                self._bins = Bins(self.rig, self._settings.bin, first - EDGE_LEAD, self._options)
-                self.next_end = first - EDGE_LEAD + self._settings.window
+                begin = float(min(first for first, _ in ends)) - EDGE_LEAD
+                self._bins = Bins(self.rig, self._settings.bin, begin, self._options)
+                self.next_end = begin + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
         for (name, reason), t in decoded.refused.items():
@@ -384,7 +385,7 @@ class Intake:
         stale = self.stale(end)
         poor = [c.name for c in self.needed if c.name in stale or covered[c.name] < self._options.min_coverage]
         task = WindowTask(
-            index=self._index,
+            index=self.ended,
             start=start,
             end=end,
             window=window,
@@ -401,7 +402,7 @@ class Intake:
             epoch=self.epoch,
         )
         self._fresh = False
-        self._index += 1
+        self.ended += 1
         bins.drop_before(start + self._settings.hop)
         self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
         self._consistency.drop_before(start + self._settings.hop)
@@ -462,13 +463,6 @@ class Intake:
 def input_rejected(refused: Mapping[str, str]) -> str:
     """Return the reason of a status for refused channels, each with why it is refused."""
     return " ".join(["input_rejected", *(f"{name} ({why})" for name, why in refused.items())])
-
-
-def _times(decoded: Decoded) -> tuple[float, float] | None:
-    """Times [s] of the earliest and the latest sample, accepted or refused; None without samples."""
-    ends = [(c.t[0], c.t[-1]) for c in decoded.columns.values() if len(c.t)]
-    ends += [(known.min(), known.max()) for t in decoded.refused.values() if len(known := t[np.isfinite(t)])]
-    return (float(min(first for first, _ in ends)), float(max(last for _, last in ends))) if ends else None
 
 
 def column_means(rows: Array) -> list[float | None]:

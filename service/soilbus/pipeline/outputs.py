@@ -23,27 +23,15 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.pipeline.states import state_after
 from soilbus.terra.soils import UNKNOWN
 
+__all__ = [
+    "FAST_FRAMES", "HOP_FRAMES", "check_cycle_times", "column_names", "demand_frame", "flat_record",
+    "forecast_frame", "hop_frames", "json_line", "known", "likeliest", "slip_frames", "value_std", "values_std",
+    "window_record"
+]  # fmt: skip
+
 if TYPE_CHECKING:
     from soilbus.decision.capability import Capability
     from soilbus.estimation.posterior import Estimate
-
-__all__ = [
-    "FAST_FRAMES",
-    "HOP_FRAMES",
-    "check_cycle_times",
-    "column_names",
-    "demand_frame",
-    "flat_record",
-    "forecast_frame",
-    "hop_frames",
-    "json_line",
-    "known",
-    "likeliest",
-    "slip_frames",
-    "value_std",
-    "values_std",
-    "window_record",
-]
 
 WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
@@ -59,20 +47,20 @@ MAX_CLASSES = 3
 """Number of known soils that a window names."""
 
 PARAMETER_FRAMES = {
-    # JSON name: (message, SI value of one unit of the DBC)
-    "k_c": ("SoilCohesiveModulus", 1e3),
-    "k_phi": ("SoilFrictionalModulus", 1e3),
-    "n": ("SoilSinkageExponent", 1.0),
-    "phi": ("SoilFrictionAngle", math.pi / 180.0),
-    "c": ("SoilCohesion", 1e3),
-    "K": ("SoilShearModulus", 1e-3),
+    "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)", 1e3),
+    "k_phi": ("SoilFrictionalModulus", "kN/m^(n+2)", 1e3),
+    "n": ("SoilSinkageExponent", "", 1.0),
+    "phi": ("SoilFrictionAngle", "deg", math.pi / 180.0),
+    "c": ("SoilCohesion", "kPa", 1e3),
+    "K": ("SoilShearModulus", "mm", 1e-3),
 }
+"""Of each parameter by its JSON name: message, unit in the DBC and in reports, and that unit's value in SI."""
 
 REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error", "second_sender": "bad_counter"}
 """Names in the value table for reasons of refusal: the signal itself has no value, or a code that older DBCs have."""
 
 HOP_FRAMES = (
-    "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
+    "SoilStrength", "SoilClass", *(message for message, *_ in PARAMETER_FRAMES.values()), "DraftCapability",
     "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2", "WindowQuality",
 )  # fmt: skip
 """Names of the frames that are sent once per window."""
@@ -108,13 +96,13 @@ def json_line(result: WindowResult, config: Config) -> str:
 
 def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
     """Return the result as nested dicts and lists (keys: docs/json.md), in SI units, None where not known."""
-    decision = result.traversability
+    decision, z_ref, driven = result.traversability, config.estimator.z_ref, result.z_driven
     bearing = {
-        "z_ref": config.estimator.z_ref,
+        "z_ref": z_ref,
         "b_ref": config.estimator.b_ref,
         **value_std(result.bearing),
-        "z_driven": None if result.z_driven is None else list(result.z_driven),
-        "extrapolates": _extrapolates(result, config.estimator.z_ref),
+        "z_driven": None if driven is None else list(driven),
+        "extrapolates": None if result.bearing is None or driven is None else not driven[0] <= z_ref <= driven[1],
     }
     posterior = result.posterior
     line = {
@@ -209,14 +197,6 @@ def column_names(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     return sorted(set(names) - wholes, key=lambda name: (keys.index(name.partition(".")[0]), names.index(name)))
 
 
-def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
-    """Whether the depth z_ref [m] of the bearing pressure lies outside the wheels' sinkages; None where not known."""
-    if result.bearing is None or result.z_driven is None:
-        return None
-    low, high = result.z_driven
-    return not low <= z_ref <= high
-
-
 def _capability(capability: Capability) -> dict[str, Any]:
     """The parts of the capability that `traversability` does not hold."""
     forecast = capability.forecast
@@ -267,7 +247,7 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
     )
     yield "SoilClass", common | _soil_class(result.soil_class)
     parameters = {} if result.posterior is None else result.posterior.parameters()
-    for name, (message, unit) in PARAMETER_FRAMES.items():
+    for name, (message, _, unit) in PARAMETER_FRAMES.items():
         yield message, common | _value_and_std("Value", "Std", parameters.get(name), unit)
     yield "DraftCapability", common | _value_and_std("MaxDraft", "MaxDraftStd", decision.max_draft, 1.0)
     yield "GradeCapability", common | _value_and_std("MaxGrade", "MaxGradeStd", decision.max_grade, 1.0)
@@ -304,8 +284,9 @@ def _advice(capability: Capability | None) -> dict[str, float | None]:
     values = {}
     for axle, name in (("front", "Front"), ("rear", "Rear")):
         point = points.get(axle)
-        values[f"SlipForEfficiency{name}"] = None if point is None else _value(point.efficiency)
-        values[f"SlipForPull{name}"] = None if point is None else _value(point.pull)
+        for what in ("Efficiency", "Pull"):
+            slip = None if point is None else getattr(point, what.lower())
+            values[f"SlipFor{what}{name}"] = None if slip is None else slip.value
     return values
 
 
@@ -341,10 +322,6 @@ def known(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [known(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _value(estimate: Estimate | None) -> float | None:
-    return None if estimate is None else estimate.value
 
 
 def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:

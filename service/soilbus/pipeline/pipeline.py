@@ -62,11 +62,6 @@ class Pipeline:
 
         return WindowEstimator(self.config)
 
-    @property
-    def next_end(self) -> float:
-        """End of the next window [s]; infinite before the first sample."""
-        return self.intake.next_end
-
     def advance(self, now: float) -> list[WindowResult]:
         """Return the results of all windows that ended at or before `now` [s]."""
         return [self.estimator.solve(task) for task in self.intake.due(now)]

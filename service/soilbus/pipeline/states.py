@@ -25,10 +25,5 @@ class ServiceState(StrEnum):
 
 def state_after(result: WindowResult) -> ServiceState:
     """Return the state of the service after a window's result, while its inputs keep coming."""
-    match result.status:
-        case Status.VALID:
-            return ServiceState.VALID
-        case Status.NOT_EXCITED:
-            return ServiceState.LISTENING
-        case _:
-            return ServiceState.DEGRADED
+    states = {Status.VALID: ServiceState.VALID, Status.NOT_EXCITED: ServiceState.LISTENING}
+    return states.get(result.status, ServiceState.DEGRADED)

@@ -7,7 +7,6 @@ deviation of draft and slip within a window, beside those of the valid windows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -69,44 +68,38 @@ def _vary(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str
     here, there = _draft(windows), _draft(valid)
     if here is None or there is None:
         return f"vary the load more: {_moved(windows)}"
-    if here.sd < there.sd:
+    if here[1] < there[1]:
         return f"vary the load: {_moved(windows, ' only')}; in the valid windows {_moved(valid)}"
     return f"vary the load for longer on one ground: {_moved(windows)}, as much as in the valid windows"
 
 
-class _Spread(NamedTuple):
-    mean: float
-    sd: float
-
-
 def _moved(windows: Sequence[WindowResult], only: str = "") -> str:
     """How much draft and slip vary within a window (standard deviations), as medians of the windows."""
-    draft, slip = _draft(windows), _slip(windows)
+    draft, slip = _draft(windows), _typical([(w.excitation.slip, w.excitation.slip_sd) for w in windows])
     said = []
     if draft is not None:
-        newtons = f"{draft.mean:.0f} ± {draft.sd:.0f} N"
-        share = 100.0 * draft.sd / abs(draft.mean) if abs(draft.mean) > draft.sd else None
-        said.append(
-            f"the draft was {newtons}" if share is None else f"the draft moved by {share:.2g} %{only} ({newtons})"
-        )
+        mean, sd = draft
+        newtons = f"{mean:.0f} ± {sd:.0f} N"
+        moved = f"moved by {100.0 * sd / abs(mean):.2g} %{only} ({newtons})" if abs(mean) > sd else f"was {newtons}"
+        said.append(f"the draft {moved}")
     if slip is not None:
-        said.append(f"slip was {100.0 * slip.mean:.1f} ± {100.0 * slip.sd:.1f} %")
+        said.append("slip was {:.1f} ± {:.1f} %".format(*(100.0 * of for of in slip)))
     return ", ".join(said) or "draft and slip are not known"
 
 
-def _draft(windows: Sequence[WindowResult]) -> _Spread | None:
+def _draft(windows: Sequence[WindowResult]) -> tuple[float, float] | None:
     """Of what is towed; None where nothing ever is, which counts as a draft of 0 all along."""
     drafts = [(w.excitation.draft, w.excitation.draft_sd) for w in windows]
     return None if all(draft == (0.0, 0.0) for draft in drafts) else _typical(drafts)
 
 
-def _slip(windows: Sequence[WindowResult]) -> _Spread | None:
-    return _typical([(w.excitation.slip, w.excitation.slip_sd) for w in windows])
-
-
-def _typical(of: Sequence[tuple[float | None, float | None]]) -> _Spread | None:
+def _typical(of: Sequence[tuple[float | None, float | None]]) -> tuple[float, float] | None:
+    """Medians of known means and standard deviations."""
     known = [(mean, sd) for mean, sd in of if mean is not None and sd is not None]
-    return _Spread(*np.median(known, axis=0).tolist()) if known else None
+    if not known:
+        return None
+    mean, sd = np.median(known, axis=0).tolist()
+    return mean, sd
 
 
 def of_use(windows: Sequence[WindowResult]) -> list[WindowResult]:

@@ -49,15 +49,14 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
                 since, onset = "", effect["onset"]
                 if onset and onset["log"] != vehicle["logs"][0]:
                     since = f", since {onset['log']} (probability {onset['probability']:.2f})"
-                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({_sizes(effect)}){since}")
+                sizes = ", ".join(
+                    f"{name} {value_text(each['value'], each['std'], AT_EDGE, '±')}"
+                    for name, each in effect["parameters"].items()
+                )
+                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({sizes}){since}")
         if vehicle["fault"]:
             lines.append(f"  {vehicle['vehicle']}: not diagnosed: {vehicle['fault']}")
     return text_of(lines)
-
-
-def _sizes(effect: Mapping[str, Any]) -> str:
-    sizes = {name: (each["value"], each["std"]) for name, each in effect["parameters"].items()}
-    return ", ".join(f"{name} {value_text(*size, AT_EDGE, '±')}" for name, size in sizes.items())
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:

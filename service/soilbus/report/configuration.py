@@ -88,18 +88,16 @@ def configuration_warnings(config: Config) -> list[str]:
     return lines
 
 
-NO_SLOPE = (
-    'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
-    " and each per cent of slope as a draft of one per cent of the weight"
-)
-"""Of a vehicle that shows_no_slope()."""
-
-
-def shows_no_slope(config: Config) -> bool:
-    """Return whether this is a vehicle without a sensor that shows the slope."""
+def no_slope(config: Config) -> str:
+    """Return a line on a vehicle without a sensor that shows the slope; "" with one."""
     felt = config.signals.acceleration
     is_felt = config.signals.pitch is not None or (felt is not None and felt.kind == "specific_force")
-    return config.vehicle is not None and config.table is None and not is_felt
+    if config.vehicle is None or config.table is not None or is_felt:
+        return ""
+    return (
+        'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
+        " and each per cent of slope as a draft of one per cent of the weight"
+    )
 
 
 def _lines_of_vehicle(config: Config) -> Iterator[str]:
@@ -116,8 +114,8 @@ def _lines_of_vehicle(config: Config) -> Iterator[str]:
             'vehicle.towing = "unknown": signals.draft is not used, so there is no GO; if it shows all that is towed,'
             ' "measured" is meant'
         )
-    if shows_no_slope(config):
-        yield NO_SLOPE
+    if line := no_slope(config):
+        yield line
     if config.vehicle.steering == "skid" and not (config.vehicle.track or config.signals.yaw_rate):
         yield (
             'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: how far the wheels slide'
@@ -252,9 +250,12 @@ def load_lines(config: Config) -> list[str]:
     if own is None or with_cells is None:
         return lines
     limit, load = config.estimator.max_bearing_std, "slope" if rig.towing == "never" else "draft"
+    way_out = "what is known of the soil, in [soil], narrows it"
+    if limit < own[0] <= BEARING_STD_WITHOUT_CELLS:
+        way_out = f"without load cells set it to {BEARING_STD_WITHOUT_CELLS:g}"
     too_wide = [
         f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std) count as not excited, and"
-        f" there is no GO; {_way_out(own[0], limit)}."
+        f" there is no GO; {way_out}."
     ]
     return [
         *lines,
@@ -263,13 +264,6 @@ def load_lines(config: Config) -> list[str]:
         " as the sensors go; what the form of the contact leaves open comes on top.",
         *(too_wide if own[0] > limit else []),
     ]
-
-
-def _way_out(std: float, limit: float) -> str:
-    """What the configuration can do about a bearing pressure that is known to no better than the limit."""
-    if limit < std <= BEARING_STD_WITHOUT_CELLS:
-        return f"without load cells set it to {BEARING_STD_WITHOUT_CELLS:g}"
-    return "what is known of the soil, in [soil], narrows it"
 
 
 def _expected(config: Config) -> tuple[float, float] | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,8 +16,6 @@ from rich.style import Style
 
 from soilbus.config.model import Config
 from soilbus.report.received_frames import IN_A_ROW, ReceivedFrames
-
-__all__ = ["Dashboard", "Vehicle", "Verdict", "force", "percent"]
 
 SAMPLE_PERIOD = 0.1
 """Least time [s] between two samples of the history: the cycle of the fast frames."""
@@ -213,13 +210,19 @@ class Dashboard:
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
-        todo = self._advice(state, str(known.value("Traversability", "LimitingCause")))
-        if state == "go" or (known.number("Traversability", "Probability") or 0.0) >= self.vehicle.go:
+        limit, probability = (
+            known.value("Traversability", "LimitingCause"),
+            known.number("Traversability", "Probability"),
+        )
+        todo = self._advice(state, str(limit))
+        if state == "go" or (probability or 0.0) >= self.vehicle.go:
             todo = HELD.get(state, todo)  # nothing limits it: more windows must say the same
-            worst = self.slip()
-            if worst.value is not None and worst.best is not None and is_above(worst.value, worst.best):
-                todo = ABOVE_BEST.get(state, todo)
-        return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
+            slip, best = self.slip().value, self.slip().best
+            if slip is not None and best is not None and round(100.0 * slip) > round(100.0 * best):
+                todo = ABOVE_BEST.get(state, todo)  # in whole per cents, as a driver reads them
+        because = [] if limit in (None, "none") else [f"limit: {limit}"]
+        because += [] if probability is None else [f"p = {probability:.2f}"]
+        return Verdict(NAMES[state], ", ".join((NAMES[state], *because)), todo, state)
 
     def _advice(self, state: str, cause: str) -> str:
         """Return what to do by state and limiting cause, or `stuck`."""
@@ -228,15 +231,6 @@ class Dashboard:
         if draft is None or draft > 0.0 or not re.search("draft|lift", said, re.IGNORECASE):
             return said
         return UNLADEN[said.startswith("Stop")]
-
-    def _because(self) -> Iterator[str]:
-        """Probability and limit of a known state."""
-        limit = self.known.value("Traversability", "LimitingCause")
-        probability = self.known.number("Traversability", "Probability")
-        if limit is not None and limit != "none":
-            yield f"limit: {limit}"
-        if probability is not None:
-            yield f"p = {probability:.2f}"
 
     def _unknown(self) -> tuple[str, str]:
         """Why the state is unknown, and what to do."""
@@ -347,11 +341,6 @@ class Dashboard:
 def percent(share: float) -> str:
     """Return a share or a slip in per cent."""
     return f"{round(100.0 * share)} %"
-
-
-def is_above(share: float, other: float) -> bool:
-    """Return whether a share is greater than another in whole per cents, as a driver reads them."""
-    return round(100.0 * share) > round(100.0 * other)
 
 
 def force(newtons: float, largest: float | None = None) -> str:

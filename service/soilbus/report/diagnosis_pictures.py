@@ -34,19 +34,23 @@ LOOKS = {"before": ("#b9b9b9", "///"), "after": ("#1f6fb4", "")}
 
 
 class Quantity(NamedTuple):
-    """Symbolic name's unit on pictures, its SI value, and the unit of its picture."""
+    """Name and unit of a quantity on pictures, and the unit's SI value."""
 
+    name: str
     unit: str
     si: float
 
 
-QUANTITIES = {"torque": Quantity("N m", 1.0), "draft": Quantity("N", 1.0), "sinkage": Quantity("mm", 1e-3)}
-"""Unit of each channel in pictures."""
-REGRESSORS = {
-    "slip": Quantity("%", 0.01), "load": Quantity("kN", 1e3), "speed": Quantity("m/s", 1.0), "since": Quantity("s", 1.0)
+QUANTITIES = {
+    "torque": Quantity("torque", "N m", 1.0), "draft": Quantity("draft", "N", 1.0),
+    "sinkage": Quantity("sinkage", "mm", 1e-3),
 }  # fmt: skip
-"""What differences are plotted over, with its unit."""
-REGRESSOR_NAMES = {"slip": "slip", "load": "load of a wheel", "speed": "ground speed", "since": "time"}
+"""The channels."""
+REGRESSORS = {
+    "slip": Quantity("slip", "%", 0.01), "load": Quantity("load of a wheel", "kN", 1e3),
+    "speed": Quantity("ground speed", "m/s", 1.0), "since": Quantity("time", "s", 1.0),
+}  # fmt: skip
+"""What differences are plotted over."""
 
 
 class Agreement(NamedTuple):
@@ -96,36 +100,14 @@ def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Pictur
     """Yield the caption and picture of a channel before and, where anything was added, after; in the same scales."""
     unit, name = QUANTITIES[of.channel], f"{of.channel} measured against modelled"
     shown = {"Before: ": of.before, "After: ": of.after} if added else {"": of.before}
-    scales = _Scales.of(of)
     for when, series in shown.items():
         difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
         typical = float(np.sqrt(np.mean(difference**2)))
         caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
         yield (
             caption[0].upper() + caption[1:],
-            picture(partial(_draw_agreement, of=of, series=series, scales=scales), 4.6, f"{when}{name}"),
+            picture(partial(_draw_agreement, of=of, series=series), 4.6, f"{when}{name}"),
         )
-
-
-class _Scales(NamedTuple):
-    """Ends of the axes, in the units of the picture: readings, regressor, and the largest difference."""
-
-    readings: tuple[float, float]
-    regressor: tuple[float, float]
-    difference: float
-
-    @classmethod
-    def of(cls, shown: Agreement) -> _Scales:
-        """Scales that hold what is before and after."""
-        both = shown.before + shown.after
-        readings = np.concatenate([values for s in both for values in (s.measured, s.modelled)])
-        regressor = np.concatenate([getattr(s, shown.regressor) for s in both])
-        difference = np.concatenate([s.measured - s.modelled for s in both])
-        unit = QUANTITIES[shown.channel].si
-        return cls(
-            _ends(readings / unit), _ends(regressor / REGRESSORS[shown.regressor].si),
-            float(np.percentile(np.abs(difference), POINTS_SHOWN)) / unit,
-        )  # fmt: skip
 
 
 def _ends(values: Array) -> tuple[float, float]:
@@ -135,10 +117,14 @@ def _ends(values: Array) -> tuple[float, float]:
     return low - space, high + space
 
 
-def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales: _Scales) -> None:
+def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series]) -> None:
     """Above: measured over modelled. Below: the difference over the regressor, with means over bins."""
     whole, part = figure.subplots(2, 1, height_ratios=[1.1, 1.0])
     unit, regressor = QUANTITIES[of.channel], REGRESSORS[of.regressor]
+    both = of.before + of.after  # whose scales are the same
+    readings = _ends(np.concatenate([values for s in both for values in (s.measured, s.modelled)]) / unit.si)
+    along = _ends(np.concatenate([getattr(s, of.regressor) for s in both]) / regressor.si)
+    off = float(np.percentile(np.abs(np.concatenate([s.measured - s.modelled for s in both])), POINTS_SHOWN)) / unit.si
     for i, one in enumerate(series):
         step = max(len(one.measured) // MAX_POINTS, 1)
         measured, modelled = one.measured / unit.si, one.modelled / unit.si
@@ -150,8 +136,8 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales
         part.plot(x[::step], difference[::step], ms=2, alpha=0.15, **points)
         means = np.array([(x[b].mean(), difference[b].mean()) for b in _bins(x)])
         part.plot(*means.T, ls="-", ms=5, lw=1.6, mec="white", mew=0.6, **look)
-    whole.plot(scales.readings, scales.readings, "-", color="black", lw=1.0, zorder=0.5)
-    whole.set(xlim=scales.readings, ylim=scales.readings)
+    whole.plot(readings, readings, "-", color="black", lw=1.0, zorder=0.5)
+    whole.set(xlim=readings, ylim=readings)
     whole.set_xlabel(f"modelled {of.channel}, {unit.unit}")
     whole.set_ylabel(f"measured, {unit.unit}")
     if len(series) > 1:
@@ -159,21 +145,19 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales
         for handle in legend.legend_handles:
             handle.set_alpha(1.0)
     part.axhline(0.0, color="black", lw=1.0)
-    part.set(xlim=scales.regressor, ylim=(-scales.difference, scales.difference))
-    part.set_xlabel(f"{REGRESSOR_NAMES[of.regressor]}, {regressor.unit}")
+    part.set(xlim=along, ylim=(-off, off))
+    part.set_xlabel(f"{regressor.name}, {regressor.unit}")
     part.set_ylabel(f"difference, {unit.unit}")
-
-
-def channel_gaps(fitted: FittedModel) -> dict[str, float]:
-    """Return the mean square of the standardised residuals of each channel's held-out readings; 1 is noise."""
-    found = grouped(fitted.held_out_series(), lambda series: series.channel)
-    return {c: float(np.mean(np.concatenate([part.standardised for part in of]) ** 2)) for c, of in found.items()}
 
 
 def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
     """Return the root of the gap of each channel, before and after, as bars."""
     models = {"before": base} if base is completed else {"before": base, "after": completed}
-    bars = {when: {c: gap**0.5 for c, gap in channel_gaps(model).items()} for when, model in models.items()}
+    bars: dict[str, dict[str, float]] = {}
+    for when, model in models.items():
+        found = grouped(model.held_out_series(), lambda series: series.channel)
+        errors = {channel: np.concatenate([part.standardised for part in of]) for channel, of in found.items()}
+        bars[when] = {channel: float(np.mean(error**2)) ** 0.5 for channel, error in errors.items()}
     words = "; ".join(
         " ".join([when, *(f"{channel} {size:.2f}" for channel, size in of.items())]).strip()
         for when, of in bars.items()

@@ -69,17 +69,13 @@ def _slip(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     filled = bar(slip.value, top, width).rstrip().ljust(width, "·")
     marks = [" "] * width
     for share, what in ((slip.best, "best"), (slip.most_pull, "most pull")):
-        if share is not None:
-            _mark(marks, place(share, top, width), f"{what} {percent(share)}")
+        if share is not None:  # an arrow with its label to the right, or to the left where there is more room
+            at, label = place(share, top, width), f"{what} {percent(share)}"
+            said = f"▲ {label}" if at + len(label) + 2 <= width else f"{label} ▲"
+            first = at if said.startswith("▲") else at - len(said) + 1
+            if first >= 0 and not "".join(marks[max(first - 1, 0) : first + len(said) + 1]).strip():
+                marks[first : first + len(said)] = said
     return [title, *(Text(filled) for _ in range(height)), Text("".join(marks).rstrip())]
-
-
-def _mark(marks: list[str], at: int, label: str) -> None:
-    """Write an arrow with its label to the right, or to the left where there is more room; not over another mark."""
-    said = f"▲ {label}" if at + len(label) + 2 <= len(marks) else f"{label} ▲"
-    first = at if said.startswith("▲") else at - len(said) + 1
-    if first >= 0 and not "".join(marks[max(first - 1, 0) : first + len(said) + 1]).strip():
-        marks[first : first + len(said)] = said
 
 
 def _draft(dashboard: Dashboard, width: int, height: int) -> list[Text]:

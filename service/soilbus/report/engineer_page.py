@@ -11,32 +11,18 @@ from collections.abc import Callable, Iterator
 
 from rich.text import Text
 
+from soilbus.pipeline.outputs import PARAMETER_FRAMES
 from soilbus.report.dashboard import Dashboard, percent
 from soilbus.report.driver_page import LEAST_HEIGHT, LEAST_WIDTH, footer, small_page
-from soilbus.report.received_frames import ReceivedFrames
+from soilbus.report.received_frames import BUS_COUNTS, ReceivedFrames
 from soilbus.report.text_charts import sparkline
 
 COLUMN = 38
 """Columns that a block needs at least."""
 GAP = 2
 """Columns between two blocks."""
-PARAMETERS = {
-    "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)"),
-    "k_φ": ("SoilFrictionalModulus", "kN/m^(n+2)"),
-    "n": ("SoilSinkageExponent", ""),
-    "φ": ("SoilFrictionAngle", "°"),
-    "c": ("SoilCohesion", "kPa"),
-    "K": ("SoilShearModulus", "mm"),
-}
 LIMITS = {"on the level": ("DraftCapability", "GradeCapability"), "here": ("TractionLimits", "TractionLimits")}
 """Messages of draft and of slope, by what they hold for."""
-FAULTS_OF_BUS = {
-    "Overruns": "overruns",
-    "Dropped": "dropped",
-    "ForeignFrames": "foreign",
-    "ErrorFrames": "errors",
-    "Reopened": "reopened",
-}
 CHARTS = {
     "slip": "slip, %",
     "draft": "draft, kN",
@@ -59,7 +45,11 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     """Return the engineer's page: at most `height` lines of at most `width` columns."""
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         return small_page(dashboard, width, height)
-    head = [_head(dashboard, width), fitted(Text("  ".join(_forecast(dashboard.known))), width)]
+    verdict, soil = dashboard.verdict(), "  ".join(_kind(dashboard.known))
+    state = f" {verdict.said}"
+    state = f"{state:<{max(width - len(soil) - 1, len(state) + 2)}}{soil} "[:width].ljust(width)
+    forecast = Text("  ".join(_forecast(dashboard.known)))
+    head = [Text(state, style=verdict.style), fitted(forecast, width)]
     blocks = [block(dashboard) for block in BLOCKS]
     columns = max(width // (COLUMN + GAP), 1)
     room = height - len(head) - 1
@@ -67,7 +57,10 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     if len(body) + LEAST_CHARTS > room:
         body = packed(blocks, columns, width, 0)
     lines = [*head, *body][: height - 1]
-    lines += _charts(dashboard, width, height - len(lines) - 1)
+    each = (width - GAP) // 2
+    charts = [_chart(dashboard, name, each) for name in CHARTS]
+    pairs = [Text(f"{left:<{each + GAP}}{right}") for left, right in zip(charts[::2], charts[1::2], strict=True)]
+    lines += [Text(f"last {dashboard.span:.0f} s", style="bold"), *pairs][: max(height - len(lines) - 1, 0)]
     lines += [Text()] * (height - 1 - len(lines))
     return [*lines, footer(dashboard, width)]
 
@@ -111,13 +104,6 @@ def grid(title: Row, *rows: Row) -> list[Text]:
     return lines
 
 
-def _head(dashboard: Dashboard, width: int) -> Text:
-    """State over the whole width, with the kind of soil."""
-    verdict, soil = dashboard.verdict(), "  ".join(_kind(dashboard.known))
-    said = f" {verdict.said}"
-    return Text(f"{said:<{max(width - len(soil) - 1, len(said) + 2)}}{soil} "[:width].ljust(width), style=verdict.style)
-
-
 def _kind(known: ReceivedFrames) -> Iterator[str]:
     yield from _said(known, "SoilClass", "Kind", "soil: {}")
     yield from _said(known, "SoilClass", "Probability", "({:.2f})")
@@ -137,7 +123,8 @@ def _forecast(known: ReceivedFrames) -> Iterator[str]:
 def _soil(dashboard: Dashboard) -> list[Text]:
     known = dashboard.known
     rows: list[Row] = [("bearing", _pair(known, "SoilStrength", "BearingPressure"), "kPa")]
-    rows += [(name, _pair(known, message, "Value", "Std"), unit) for name, (message, unit) in PARAMETERS.items()]
+    for name, (message, unit, _) in PARAMETER_FRAMES.items():
+        rows.append((name.replace("phi", "φ"), _pair(known, message, "Value", "Std"), unit.replace("deg", "°")))
     return grid(("soil", "value ± std", "unit"), *rows)
 
 
@@ -213,7 +200,7 @@ def _service(dashboard: Dashboard) -> list[Text]:
     shown = "-" if None in version else ".".join(f"{part:.0f}" for part in version)
     shown += "".join(_said(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s"))
     bus = "".join(_said(known, "BusHealth", "BusState", "{}")) or "-"
-    counts = ((what, known.number("BusHealth", signal)) for signal, what in FAULTS_OF_BUS.items())
+    counts = ((key.partition("_")[0], known.number("BusHealth", signal)) for signal, key in BUS_COUNTS.items())
     faults = [f"{what} {count:.0f}" for what, count in counts if count]
     rows: list[Row] = [("state", state or "-"), ("version", shown), ("bus", bus)]
     pairs = [" ".join(faults[i : i + 2]) for i in range(0, len(faults), 2)]
@@ -221,15 +208,6 @@ def _service(dashboard: Dashboard) -> list[Text]:
 
 
 BLOCKS: tuple[Callable[[Dashboard], list[Text]], ...] = (_soil, _wheels, _limits, _gap, _advice, _refused, _service)
-
-
-def _charts(dashboard: Dashboard, width: int, height: int) -> list[Text]:
-    """Histories of the last minute side by side in two columns, as many as there is room for."""
-    each = (width - GAP) // 2
-    charts = [_chart(dashboard, name, each) for name in CHARTS]
-    pairs = zip(charts[::2], charts[1::2], strict=True)
-    title = Text(f"last {dashboard.span:.0f} s", style="bold")
-    return [title, *(Text(f"{left:<{each + GAP}}{right}") for left, right in pairs)][: max(height, 0)]
 
 
 def _chart(dashboard: Dashboard, name: str, width: int) -> str:

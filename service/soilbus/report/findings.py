@@ -19,9 +19,8 @@ from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.diagnose import Findings
-from soilbus.pipeline.outputs import known, value_std, values_std
+from soilbus.pipeline.outputs import PARAMETER_FRAMES, known, value_std, values_std
 from soilbus.report.next_drive import plan_lines
-from soilbus.report.soil_prior import SHOWN
 from soilbus.report.statement import (
     doubt,
     is_open,
@@ -79,7 +78,16 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "configured": {name: values_std(values) for name, values in diagnosis.base.prior_parameters().items()},
         "model": {name: values_std(values) for name, values in findings.diagnosis.completed.parameters().items()},
         "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
-        "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
+        "learned": [
+            {
+                "channel": description.channel,
+                "wheel": description.wheel,
+                "formula": description.formula,
+                "terms": {term.regressor: term.coefficient for term in description.terms},
+                "explained": description.explained,
+            }
+            for description in diagnosis.residual_terms
+        ],
         "warning": WARNING if diagnosis.residual_terms else None,
         "samples": recordings.samples,
         "rejected": recordings.rejected,
@@ -132,16 +140,6 @@ def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
     }
 
 
-def _residual_terms(description: ResidualTerms) -> dict[str, Any]:
-    return {
-        "channel": description.channel,
-        "wheel": description.wheel,
-        "formula": description.formula,
-        "terms": {term.regressor: term.coefficient for term in description.terms},
-        "explained": description.explained,
-    }
-
-
 def why_ambiguous(addition: Addition) -> str | None:
     """Why the alternatives of an effect stay in the set; None where it has none."""
     if not addition.alternatives:
@@ -164,7 +162,12 @@ def _soil(posterior: Posterior, findings: Findings) -> dict[str, Any]:
 def findings_text(findings: Findings) -> str:
     """All findings for a reader at a terminal."""
     diagnosis = findings.diagnosis
-    lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
+    before, after = diagnosis.gap_before, diagnosis.gap_after
+    lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), ""]
+    lines.append(
+        f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
+        f"noise alone: 1, hardly ever above {after.limit():.2f})"
+    )
     lines += [f"  {line}" for line in place_lines(findings)]
     lines += [*configured_lines(diagnosis), *shown_lines(diagnosis, findings.config)]
     for number, addition in enumerate(diagnosis.additions, 1):
@@ -179,17 +182,12 @@ def findings_text(findings: Findings) -> str:
             for terms in diagnosis.residual_terms
         ]
         lines.append(f"  {WARNING}")
-    lines += ["", *_soil_lines(findings), "", admission_line(findings)]
-    return text_of(lines)
-
-
-def gap_line(findings: Findings) -> str:
-    """The gap before and after, and that of noise alone."""
-    before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
-    return (
-        f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
-        f"noise alone: 1, hardly ever above {after.limit():.2f})"
-    )
+    recordings = findings.recordings
+    refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
+    short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
+    logs = "one log" if len(recordings.first) == 1 else f"{len(recordings.first)} logs"
+    used = f"{recordings.samples} samples of {logs}; refused samples: {refused}{short}"
+    return text_of([*lines, "", *_soil_lines(findings), "", used])
 
 
 def place_lines(findings: Findings) -> list[str]:
@@ -268,19 +266,9 @@ def _soil_lines(findings: Findings) -> Iterator[str]:
         for posterior in both:
             found = {"bearing pressure, kPa": (posterior.bearing_pressure(settings.z_ref, settings.b_ref), 1e3)}
             for name, estimate in posterior.parameters().items():
-                unit, size = SHOWN[name]
+                _, unit, size = PARAMETER_FRAMES[name]
                 found[f"{name}, {unit}".rstrip(", ")] = estimate, size
             for name, (of, size) in found.items():
                 rows.setdefault(name, []).append(value_text(of.value / size, of.std / size))
         head = (f"soil of {log}" if several else "soil", "before", "after")
         yield from table(head, [(name, *texts) for name, texts in rows.items()]).splitlines()
-
-
-def admission_line(findings: Findings) -> str:
-    """Samples used and refused."""
-    recordings = findings.recordings
-    refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
-    short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
-    n = len(recordings.first)
-    logs = "one log" if n == 1 else f"{n} logs"
-    return f"{recordings.samples} samples of {logs}; refused samples: {refused}{short}"

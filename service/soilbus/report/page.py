@@ -117,13 +117,13 @@ def _vehicle_rows(config: Config) -> Iterator[tuple[str, str]]:
                 f"ahead of the rear axle and {vehicle.cg_height:g} m high, hitch {vehicle.hitch_height:g} m high"
             ),
         )
-    alike = groupby(config.wheel, _wheel_text)
+
+    def text_of(wheel: Wheel) -> str:
+        track = f", {wheel.contact_length:g} m of track on the ground" if wheel.contact_length else ""
+        return f"radius {wheel.radius:g} m, width {wheel.width:g} m{track}" + ("" if wheel.driven else ", not driven")
+
+    alike = groupby(config.wheel, text_of)
     yield "Wheels", "; ".join(f"{', '.join(wheel.name for wheel in wheels)}: {text}" for text, wheels in alike)
-
-
-def _wheel_text(wheel: Wheel) -> str:
-    track = f", {wheel.contact_length:g} m of track on the ground" if wheel.contact_length else ""
-    return f"radius {wheel.radius:g} m, width {wheel.width:g} m{track}" + ("" if wheel.driven else ", not driven")
 
 
 def page(template: str, source: Source, **content: Any) -> str:
@@ -148,19 +148,16 @@ def _printable(value: Any) -> Any:
     return type(value)("\n".join(shown(line, len(line)) for line in value.split("\n")))
 
 
-def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH, dpi: int = DPI) -> Picture:
-    """Return a picture for a page: `draw` draws into an empty matplotlib figure, `words` say what it shows.
-
-    Height and width are in inches, `dpi` is pixels for each.
-    """
+def picture(draw: Callable[[Any], None], height: float, words: str) -> Picture:
+    """Return a picture of this height [inch]: `draw` fills a matplotlib figure, `words` say what it shows."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     png = io.BytesIO()
     with mpl.rc_context(STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
         draw(figure)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Glyph")  # of a log's name; the page itself has it
-            figure.savefig(png, format="png", dpi=dpi)
+            figure.savefig(png, format="png", dpi=DPI)
     return Picture(words, base64.b64encode(png.getvalue()).decode())

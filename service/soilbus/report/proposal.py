@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import tomlkit
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Database, Message
 from tomlkit import TOMLDocument
 from tomlkit.items import Table
 
 from soilbus.can.channels import WHOLE
 from soilbus.can.columns import unit_in
-from soilbus.can.mapping import VEHICLE_ROLES
+from soilbus.can.mapping import DIMENSIONS, VEHICLE_ROLES
 from soilbus.can.role_matching import (
     AXLES,
     ONLY,
@@ -30,7 +30,6 @@ from soilbus.can.role_matching import (
     Slot,
     axles_of,
     described,
-    dimensions_of,
     is_word_in,
 )
 from soilbus.can.validity import vouching_codes
@@ -39,8 +38,6 @@ from soilbus.config.file import OPEN
 from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts
 from soilbus.words import shown
-
-__all__ = ["Proposal", "proposal"]
 
 BEARING_STD_WITHOUT_CELLS = 0.2
 """`estimator.max_bearing_std` [1] for machines without load cells: their windows know the bearing pressure to 10 to
@@ -121,11 +118,12 @@ class _Draft:
         message = self.database.get_message_by_name(c.message)
         short = [s.name for s in message.signals if s.length <= MOST_STATE_BITS]
         state = next((name for name in short if is_word_in(name, "state")), "")
-        valid = _valid_signal(message, c)
+        vouching = [s for s in message.signals if s.name != c.signal and s.length <= 2 and is_word_in(s.name, "valid")]
+        valid = vouching[0] if len(vouching) == 1 else None
         back = self.facts.backward.get(c.path)
         said = _said_backward(message, c)
         value = tomlkit.inline_table()
-        value.update({"signal": c.path, **more})
+        value.update({"signal": c.path, **more} | ({"at": "wheel"} if key == "torque" and _is_at_wheel(c) else {}))
         if valid is not None:
             value["valid"] = valid.name
             if valid.choices:
@@ -280,7 +278,7 @@ def _put_axle(draft: _Draft, axle: str) -> None:
             _put_gear(draft, axle)
         draft.put_open("differential", '"open", "locked" or "limited"')
         if known is not None:
-            draft.put_signal("torque", torque, **_side(torque))
+            draft.put_signal("torque", torque)
         else:
             draft.put_choice("torque", [torque], "")
         _put_limit(draft, torque, "axle")
@@ -304,7 +302,7 @@ def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
     if motor is not None or (torque is not None and not _is_at_wheel(torque)):
         _put_gear(draft, wheel)
     if torque is not None:
-        draft.put_signal("torque", torque, **_side(torque))
+        draft.put_signal("torque", torque)
         _put_limit(draft, torque, "wheel")
     elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
         draft.put_open("driven", "true or false: no torque of it was found")
@@ -329,7 +327,9 @@ def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
 def _put_gear(draft: _Draft, place: str) -> None:
     ratio = draft.facts.gear_ratio.get(place)
     if ratio is not None:
-        draft.put("gear_ratio", _rounded(ratio), "motor over wheel speed in the log")
+        short = float(f"{ratio:.3g}")
+        rounded = short if abs(short / ratio - 1.0) < ROUNDING else float(f"{ratio:.4g}")
+        draft.put("gear_ratio", rounded, "motor over wheel speed in the log")
         return
     per_metre = draft.facts.per_metre.get(place)
     text = "motor shaft to wheel; 1.0 where torque is measured at the wheel"
@@ -358,30 +358,19 @@ def _is_at_wheel(torque: Candidate) -> bool:
     return is_word_in(torque, "wheel") and not is_word_in(torque, "motor", "shaft")
 
 
-def _side(torque: Candidate) -> dict[str, str]:
-    return {"at": "wheel"} if _is_at_wheel(torque) else {}
-
-
 def _put_signals(draft: _Draft) -> None:
     draft.section("signals")
     draft.note("positive: ground speed and torque forward, draft backward, pitch nose up, yaw left, roll left side up")
     for role in VEHICLE_ROLES:
         c = draft.matched(role)
-        if c is None:
-            if role == "ground_speed":
-                known = _of_role(draft, role, "")
-                draft.put_choice(role, known, '"Message.Signal" of a radar or receiver, not of the wheels')
-            continue
-        if role == "acceleration":
-            kind = draft.facts.kind or _kind_by_words(draft.database, c)
-            if kind != "kinematic":
-                draft.put_signal(role, c, kind=kind or OPEN)
-            else:
-                draft.put_signal(role, c)
+        if c is not None:
+            kind = draft.facts.kind or _kind_by_words(draft.database, c) if role == "acceleration" else "kinematic"
+            draft.put_signal(role, c, **({} if kind == "kinematic" else {"kind": kind or OPEN}))
             if not kind:
                 draft.note('kind: "kinematic" is dv/dt, "specific_force" what an inertial sensor feels, slope included')
-        else:
-            draft.put_signal(role, c)
+        elif role == "ground_speed":
+            known = _of_role(draft, role)
+            draft.put_choice(role, known, '"Message.Signal" of a radar or receiver, not of the wheels')
 
 
 def _put_rest(draft: _Draft) -> None:
@@ -417,13 +406,13 @@ def _put_rest(draft: _Draft) -> None:
 # --- words ---
 
 
-def _of_role(draft: _Draft, role: str, place: str) -> list[Candidate]:
+def _of_role(draft: _Draft, role: str, place: str = "") -> list[Candidate]:
     """Candidates of an open slot, else those of the role wherever they are, else what has a unit of it there."""
     own = draft.assignment.open.get(Slot(role, place))
     anywhere = (c for slot, cs in draft.assignment.open.items() if slot.role == role for c in cs)
     loose = (c for slot, c in draft.assignment.asserted.items() if slot.role == role and not slot.place)
     named = own or sorted([*anywhere, *loose], key=lambda c: -c.score)
-    fitting = dimensions_of(role)
+    fitting = DIMENSIONS[role]
     return named or [c for c in draft.assignment.unnamed if c.slot.place == place and c.dimension in fitting]
 
 
@@ -454,17 +443,6 @@ def _said_backward(message: Message, c: Candidate) -> str:
     comment = message.get_signal_by_name(c.signal).comment or ""
     pattern = rf"positive (?:{_OTHER_WAY.get(c.slot.role, '(?!)')})\b"
     return found[0] if (found := re.search(pattern, comment, re.IGNORECASE)) else ""
-
-
-def _valid_signal(message: Message, c: Candidate) -> Signal | None:
-    """The one signal of the message that vouches for another; None where there is none, or several."""
-    found = [s for s in message.signals if s.name != c.signal and s.length <= 2 and is_word_in(s.name, "valid")]
-    return found[0] if len(found) == 1 else None
-
-
-def _rounded(ratio: float) -> float:
-    short = float(f"{ratio:.3g}")
-    return short if abs(short / ratio - 1.0) < ROUNDING else float(f"{ratio:.4g}")
 
 
 ROUNDING = 0.001

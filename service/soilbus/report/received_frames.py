@@ -36,6 +36,11 @@ IN_A_ROW = 5
 """Frames in a row, each with the next counter, that go and caution need: in their 0.4 s soilbus itself has spoken."""
 LEAST_CYCLES = 2
 """Cycles that these frames take at least: a faster second sender could send five between two frames of soilbus."""
+BUS_COUNTS = {
+    "Overruns": "overruns", "Dropped": "dropped", "ForeignFrames": "foreign_frames", "ErrorFrames": "error_frames",
+    "Reopened": "reopened",
+}  # fmt: skip
+"""Signals of BusHealth that are counts, and their keys in JSON."""
 STATES = ("unknown", "no_go", "caution", "go")
 """States of Traversability, the least first."""
 
@@ -168,8 +173,7 @@ class ReceivedFrames:
 
     def is_at_top(self, message: str, signal: str) -> bool:
         """Return whether a number is the greatest that its signal can say."""
-        value = self.number(message, signal)
-        top = None if value is None else self._signals[message][signal].maximum
+        value, top = self.number(message, signal), self._signals[message][signal].maximum
         return value is not None and top is not None and value >= top
 
     def is_valid(self, message: str) -> bool:

@@ -9,18 +9,7 @@ from typing import Any
 
 from soilbus.pipeline.outputs import PARAMETER_FRAMES, known
 from soilbus.report.dashboard import Dashboard
-from soilbus.report.received_frames import ReceivedFrames
-
-__all__ = ["gist", "received_record"]
-
-COUNTS = {
-    "reopened": "Reopened",
-    "overruns": "Overruns",
-    "dropped": "Dropped",
-    "foreign_frames": "ForeignFrames",
-    "error_frames": "ErrorFrames",
-}
-"""Keys and signals of BusHealth that are counts."""
+from soilbus.report.received_frames import BUS_COUNTS, ReceivedFrames
 
 
 def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
@@ -39,7 +28,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         "reason": value("SoilbusStatus", "Reason"),
         "soil": {
             name: _value_std(received, message, "Value", unit, "Std")
-            for name, (message, unit) in PARAMETER_FRAMES.items()
+            for name, (message, _, unit) in PARAMETER_FRAMES.items()
         },
         "bearing_pressure": _value_std(received, "SoilStrength", "BearingPressure", 1e3),
         "soil_class": None
@@ -76,7 +65,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         },
         "demand": {"draft": number("PresentDemand", "Draft"), "slope": number("PresentDemand", "Slope")},
         "chi2": number("SoilStrength", "Chi2"),
-        "bus": {key: _whole(number("BusHealth", signal)) for key, signal in COUNTS.items()},
+        "bus": {key: _whole(number("BusHealth", signal)) for signal, key in BUS_COUNTS.items()},
         "bad_frames": received.bad_frames,
         "second_sender": received.has_second_sender,
         "fault": dashboard.fault or None,

@@ -12,7 +12,7 @@ from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
-from soilbus.report.configuration import NO_SLOPE, shows_no_slope
+from soilbus.report.configuration import no_slope
 from soilbus.report.page import Picture, Source, Step, page
 from soilbus.report.replay_pictures import (
     STATES,
@@ -121,8 +121,8 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[Step
         yield Step("Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html")
     if config.table is not None:
         return
-    if shows_no_slope(config):
-        yield Step(f"{NO_SLOPE[0].upper()}{NO_SLOPE[1:]}.")
+    if line := no_slope(config):
+        yield Step(f"{line[0].upper()}{line[1:]}.")
     if config.signals.latitude is None:
         yield Step("For a map of the route, map a position: signals.latitude and signals.longitude.")
     if not any(wheel.sinkage is not None for wheel in config.wheel):

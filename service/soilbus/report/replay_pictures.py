@@ -60,6 +60,11 @@ STATUSES = {
 }
 
 
+FRICTION = (lambda r: None if r.posterior is None else r.posterior.parameters()["phi"]), math.radians(1.0)
+"""The friction angle of a window, and the unit of its picture."""
+HOLD = "How well {} hold against shearing off?"
+
+
 def stretches(results: Sequence[WindowResult]) -> list[list[WindowResult]]:
     """Return the windows cut where another log, or another time of its clock, begins."""
     cut: list[list[WindowResult]] = []
@@ -133,6 +138,8 @@ class TimeAxis:
 
 def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture:
     """Return the decision as a ribbon, the estimate's quality below, and the draft beside the largest possible."""
+    from matplotlib.patches import Patch
+
     time = TimeAxis(results, config.estimator.hop)
 
     def draw(figure: Any) -> None:
@@ -146,7 +153,8 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
         pulled = time.curve(lambda r: r.excitation.draft)
         if np.isfinite(pulled[:, 1]).any():
             axis.plot(pulled[:, 0], pulled[:, 1] / 1e3, "-", color="black", lw=1.3, label="pulled")
-        warnings = [t + shift for part, shift in zip(time.parts, time.shift, strict=True) for t in _begun(part)]
+        parts = zip(time.parts, time.shift, strict=True)
+        warnings = [t + shift for part, shift in parts for r in part for t in r.warnings.begun]
         if warnings:
             axis.plot(
                 warnings, np.full(len(warnings), 0.97), "v", color=STATES[State.NO_GO].colour, clip_on=False,
@@ -160,7 +168,13 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
             axis.text(0.5, 0.5, "no draft is known", ha="center", va="center", transform=axis.transAxes)
             axis.set_yticks([])
         time.dress(axis)
-        _legend(figure, [look for look in (*STATES.values(), *STATUSES.values()) if look in unnamed])
+        handles = [
+            Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4, label=look.name)
+            for look in (*STATES.values(), *STATUSES.values())
+            if look in unnamed
+        ]
+        if handles:
+            figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4), frameon=False)
 
     words = "over time: may the tractor go on, quality of the estimate, draft pulled and largest possible draft"
     return picture(draw, 4.0, words)
@@ -170,56 +184,51 @@ def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[
     """Yield the caption and picture of each quantity over time that is known anywhere, the bearing pressure first."""
     time = TimeAxis(results, config.estimator.hop)
     plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
-    wheels = list(results[0].slip)
-
-    drawn = partial(_over_time, time)
+    firm = f"How firm is the ground? Pressure that carries {plate}."
+    agreement = "How well do model and sensors agree? At 1 as well as the sensors’ noise allows."
+    curves: list[tuple[str, str, str, Callable[[Any], None]]] = []
     if of_use(results):
-        yield (
-            f"How firm is the ground? Pressure that carries {plate}.",
-            drawn("bearing pressure, kPa", lambda a: _band(a, time, lambda r: r.bearing, 1e3), "bearing pressure"),
-        )
-        yield (
-            "How well does the ground hold against shearing off?",
-            drawn("friction angle, °", lambda a: _band(a, time, _friction, math.radians(1.0)), "friction angle"),
-        )
-        yield (
-            "How well do model and sensors agree? At 1 as well as the sensors’ noise allows.",
-            drawn("model’s error, × noise", lambda a: _draw_gap(a, time), "misfit of the model"),
-        )
-    if any(slip is not None for r in results for slip in r.slip.values()):
-        yield (
-            "How much does each wheel slip?",
-            drawn("slip, %", lambda a: _draw_wheels(a, time, wheels, "slip", 0.01), "slip of each wheel"),
-        )
-    if any(z is not None for r in results for z in r.sinkage.values()):
-        yield (
-            "How deep does each wheel sink, by the estimated soil?",
-            drawn("sinkage, mm", lambda a: _draw_wheels(a, time, wheels, "sinkage", 1e-3), "sinkage of each wheel"),
-        )
+        curves += [
+            (firm, "bearing pressure, kPa", "bearing pressure", lambda a: _band(a, time, lambda r: r.bearing, 1e3)),
+            (
+                HOLD.format("does the ground"),
+                "friction angle, °",
+                "friction angle",
+                lambda a: _band(a, time, *FRICTION),
+            ),
+            (agreement, "model’s error, × noise", "misfit of the model", lambda a: _draw_gap(a, time)),
+        ]
+    for caption, quantity, label, unit in (
+        ("How much does each wheel slip?", "slip", "slip, %", 0.01),
+        ("How deep does each wheel sink, by the estimated soil?", "sinkage", "sinkage, mm", 1e-3),
+    ):
+        if any(value is not None for r in results for value in getattr(r, quantity).values()):
+            draw = partial(_draw_wheels, time=time, wheels=list(results[0].slip), quantity=quantity, unit=unit)
+            curves.append((caption, label, f"{quantity} of each wheel", draw))
+    for caption, label, words, draw_curve in curves:
+        yield caption, _over_time(time, label, draw_curve, words)
 
 
 def run_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
     """Yield the caption and picture of the soil in each run of a test rig."""
 
     def drawn(label: str, of: Callable[[WindowResult], Estimate | None], unit: float) -> Picture:
-        return picture(lambda figure: _draw_runs(figure, results, of, unit, label), 3.2, f"{label} of each run")
+        known = [(i + 1, e.value / unit, e.std / unit) for i, r in enumerate(results) if (e := of(r)) is not None]
+
+        def draw(figure: Any) -> None:
+            axis = figure.subplots()
+            if known:
+                x, y, sd = np.array(known).T
+                axis.errorbar(x, y, BAND_SD * sd, fmt="o", capsize=3)
+            axis.set_xlim(0.5, len(results) + 0.5)
+            axis.xaxis.get_major_locator().set_params(integer=True)
+            axis.set_xlabel("run")
+            axis.set_ylabel(label)
+
+        return picture(draw, 3.2, f"{label} of each run")
 
     yield "How firm was the ground in each run?", drawn("bearing pressure, kPa", lambda r: r.bearing, 1e3)
-    yield "How well did it hold against shearing off?", drawn("friction angle, °", _friction, math.radians(1.0))
-
-
-def _draw_runs(
-    figure: Any, results: Sequence[WindowResult], of: Callable[[WindowResult], Estimate | None], unit: float, label: str
-) -> None:
-    axis = figure.subplots()
-    known = [(i + 1, e.value / unit, e.std / unit) for i, r in enumerate(results) if (e := of(r)) is not None]
-    if known:
-        x, y, sd = np.array(known).T
-        axis.errorbar(x, y, BAND_SD * sd, fmt="o", capsize=3)
-    axis.set_xlim(0.5, len(results) + 0.5)
-    axis.xaxis.get_major_locator().set_params(integer=True)
-    axis.set_xlabel("run")
-    axis.set_ylabel(label)
+    yield HOLD.format("did it"), drawn("friction angle, °", *FRICTION)
 
 
 def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
@@ -228,15 +237,6 @@ def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
     if len(placed) > 1:
         words = "map of the route, coloured by decision"
         yield "The route by decision.", picture(lambda figure: _draw_map(figure, placed), 4.0, words)
-
-
-def _begun(part: Sequence[WindowResult]) -> list[float]:
-    """When warnings of immobilisation began [s]."""
-    return [t for r in part for t in r.warnings.begun]
-
-
-def _friction(result: WindowResult) -> Estimate | None:
-    return None if result.posterior is None else result.posterior.parameters()["phi"]
 
 
 def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None], words: str) -> Picture:
@@ -273,17 +273,6 @@ def _ribbon(axis: Any, time: TimeAxis, look_of: Callable[[WindowResult], Look], 
     return seen - written
 
 
-def _legend(figure: Any, looks: Sequence[Look]) -> None:
-    from matplotlib.patches import Patch
-
-    if not looks:
-        return
-    handles = [
-        Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4, label=look.name) for look in looks
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4), frameon=False)
-
-
 def _band(
     axis: Any, time: TimeAxis, of: Callable[[WindowResult], Estimate | None], unit: float, label: str | None = None
 ) -> None:
@@ -301,8 +290,7 @@ def _band(
 
 
 def _draw_gap(axis: Any, time: TimeAxis) -> None:
-    t, chi2 = time.curve(lambda r: r.chi2 if of_use([r]) else None).T
-    axis.plot(t, np.sqrt(chi2), ".-" if len(t) <= FEW_WINDOWS else "-", color="#1f6fb4", ms=4, lw=1.4)
+    _band(axis, time, lambda r: None if r.chi2 is None else Estimate(math.sqrt(r.chi2), 0.0), 1.0)
     axis.axhline(1.0, color="0.3", lw=1.0, ls="--")
     low, high = axis.get_ylim()
     axis.set_ylim(min(low, 0.5), max(high, 1.5))

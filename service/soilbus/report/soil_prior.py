@@ -13,14 +13,10 @@ from collections.abc import Iterator
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import NORMAL_95, PARAMETERS
+from soilbus.pipeline.outputs import PARAMETER_FRAMES
 from soilbus.report.table import table
 from soilbus.terra.soils import KINDS, SOILS
 
-SHOWN = {
-    "k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0), "phi": ("deg", math.pi / 180.0),
-    "c": ("kPa", 1e3), "K": ("mm", 1e-3),
-}  # fmt: skip
-"""Unit of each parameter, and its value in SI."""
 MAX_SOILS_NAMED = 3
 """Soils outside an interval that are named; the others are counted."""
 
@@ -38,7 +34,7 @@ def prior_text(config: Config) -> str:
 def _rows(config: Config) -> Iterator[tuple[str, ...]]:
     prior = prior_of(config)
     for name, median, log_std in zip(PARAMETERS, prior.median.tolist(), prior.log_std.tolist(), strict=True):
-        unit, size = SHOWN[name]
+        _, unit, size = PARAMETER_FRAMES[name]
         low, high = (median * math.exp(way * NORMAL_95 * log_std) for way in (-1.0, 1.0))
         if log_std == 0.0:
             yield name, f"{median / size:.3g}", "held", "", unit, ""

@@ -129,18 +129,13 @@ def doubt(diagnosis: Diagnosis) -> str | None:
 
     Open fits, sizes at an edge, effects that explain the data only together, effects that were not tried.
     """
-    reasons = _not_converged(diagnosis), _at_limits(diagnosis), _imitation(diagnosis), _held(diagnosis)
+    open_fit = None  # it has too little evidence, so that each effect seems to explain too much beside it
+    if not diagnosis.base.converged:
+        open_fit = "the fit of the present model did not converge, so evidence and names are a list of what to check"
+        open_fit += ", no finding"
+    reasons = open_fit, _at_limits(diagnosis), _imitation(diagnosis), _held(diagnosis)
     found = [text for text in reasons if text is not None]
     return "to be doubted: " + "; ".join(found) if found else None
-
-
-def _not_converged(diagnosis: Diagnosis) -> str | None:
-    """An end short of the optimum has too little evidence, so that each effect seems to explain too much beside it."""
-    if diagnosis.base.converged:
-        return None
-    return (
-        "the fit of the present model did not converge, so evidence and names are a list of what to check, no finding"
-    )
 
 
 def _at_limits(diagnosis: Diagnosis) -> str | None:

@@ -15,7 +15,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Protocol
@@ -25,20 +25,18 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from soilbus.can.admission import LONGEST_GAP
 from soilbus.can.bus import LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.can.wire import Received
 from soilbus.config.model import Config
-from soilbus.offline.replay import LogError, read_log
+from soilbus.offline.played_bus import PlayedBus, PlayedClock
+from soilbus.offline.replay import LogError, read_frames
 from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.driver_page import driver_page
 from soilbus.report.engineer_page import engineer_page
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.received_record import gist, received_record
 from soilbus.words import shown
-
-__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "print_results", "show", "watch"]
 
 REDRAW_PERIOD = 0.2
 """Time [s] between two pictures."""
@@ -57,70 +55,6 @@ class Source(Protocol):
 
     def receive(self, timeout: float, /) -> Received | can.Message | None:
         """Return the next frame, or None after at most `timeout` [s]."""
-
-
-class PlayedLog:
-    """Frames of a recording, each when it is due by a clock [s], `speed` times as fast as they came.
-
-    One whose stamp goes back is due at once, and a silence takes LONGEST_GAP at most.
-    """
-
-    fault = ""
-
-    def __init__(
-        self,
-        messages: Iterable[can.Message],
-        speed: float = 1.0,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._messages, self._speed, self._clock, self._sleep = iter(messages), speed, clock, sleep
-        self._next = next(self._messages, None)
-        self._first = self._due = 0.0 if self._next is None else self._next.timestamp
-        self._began = clock()
-
-    @property
-    def is_over(self) -> bool:
-        """Whether all frames were handed out."""
-        return self._next is None
-
-    def now(self) -> float:
-        """Return the time [s] of the recording, without the jumps of its clock.
-
-        It waits for a frame that is not handed out yet, and stands still after the last.
-        """
-        return min(self._first + self._speed * (self._clock() - self._began), self._due)
-
-    def receive(self, timeout: float, /) -> can.Message | None:
-        """Return the next frame, or None after at most `timeout` [s]."""
-        message = self._next
-        if message is None:
-            return None
-        wait = (self._due - self.now()) / self._speed
-        if wait > 0.0:
-            self._sleep(min(wait, timeout))
-            if wait > timeout:
-                return None
-        self._next = next(self._messages, None)
-        if self._next is not None:  # the recording's clock may be set
-            self._due += min(max(self._next.timestamp - message.timestamp, 0.0), LONGEST_GAP)
-        return message
-
-
-class Pace:
-    """Clock of a recording that is played `speed` times as fast: only `sleep` moves it on."""
-
-    def __init__(self, speed: float) -> None:
-        self._speed, self._began, self._now = speed, time.monotonic(), 0.0
-
-    def __call__(self) -> float:
-        """The present time [s]."""
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        """Let this time of the recording pass, and as much real time as belongs to it."""
-        self._now += seconds
-        time.sleep(max(0.0, self._began + self._now / self._speed - time.monotonic()))
 
 
 def watch(
@@ -146,31 +80,29 @@ def watch(
         The recording cannot be read, or has no frame of ours.
     """
     database, vehicle = output_database(config), Vehicle.of(config, names_wheels)
+    settings, filters = config.bus.model_dump(), filters_of(database)
     until = math.inf if seconds is None else time.monotonic() + seconds
 
-    def show_from(source: Source, received: ReceivedFrames, stays: bool) -> None:
+    def show_from(source: PlayedBus | LiveBus, received: ReceivedFrames) -> None:
         def done() -> bool:
-            return time.monotonic() >= until or (isinstance(source, PlayedLog) and source.is_over)
+            return time.monotonic() >= until or (isinstance(source, PlayedBus) and source.is_empty)
 
         dashboard = Dashboard(received, vehicle)
         if as_json:
             print_results(dashboard, source, sys.stdout, done)
         else:
-            show(dashboard, source, Console(), plain, done, stays=stays)
+            show(dashboard, source, Console(), plain, done, stays=log is not None and seconds is None)
 
     if log is not None:
-        ours = {(message.frame_id, message.is_extended_frame) for message in database.messages}
-        messages = (m for m in read_log(log) if (m.arbitration_id, m.is_extended_id) in ours)
-        pace = Pace(speed)
-        played = PlayedLog(messages, 1.0, pace, pace.sleep) if as_json else PlayedLog(messages, speed)
-        if played.is_over:
+        clock = PlayedClock(speed)
+        played = PlayedBus(read_frames(log), filters, clock)
+        if played.is_empty:
             raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
-        show_from(played, ReceivedFrames(database, played.now), seconds is None)
+        show_from(played, ReceivedFrames(database, clock))
         return
-    settings, filters = config.bus.model_dump(), filters_of(database)
     with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
         bus.open()
-        show_from(bus, ReceivedFrames(database), False)
+        show_from(bus, ReceivedFrames(database))
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:

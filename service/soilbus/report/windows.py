@@ -17,7 +17,7 @@ from soilbus.grouping import grouped
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
-from soilbus.report.configuration import NO_SLOPE, shows_no_slope
+from soilbus.report.configuration import no_slope
 from soilbus.words import text_of
 
 
@@ -30,7 +30,7 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     if pipeline.admission.missed:
         heard += f"; {pipeline.admission.missed} skipped by their counters"
     doubted = list(doubts(counts.received, counts.refused).values())
-    return summary_of(results, heard, refusals.used, refusals.total, shows_no_slope(pipeline.config), doubted)
+    return summary_of(results, heard, refusals.used, refusals.total, no_slope(pipeline.config), doubted)
 
 
 def summary_of(
@@ -38,19 +38,23 @@ def summary_of(
     heard: str,
     used: int | None,
     refused: Counter[str],
-    no_slope: bool = False,
+    unseen_slope: str = "",
     doubted: Sequence[str] = (),
 ) -> str:
     """Return the summary of windows that were `heard` from any source, such as "5000 mapped frames".
 
-    Samples used are None where they were not counted; `refused` is by reason. `no_slope` says that no sensor shows the
-    slope, `doubted` which messages cannot be trusted.
+    Samples used are None where they were not counted; `refused` is by reason. `unseen_slope` is said where no sensor
+    shows the slope, and `doubted` of messages that cannot be trusted.
     """
     good = [r for r in results if r.status is Status.VALID]
     estimated = len(of_use(results)) - len(good)
     lines = [f"{len(results)} windows from {heard}"]
-    lines.append(f"of use: {len(good)} valid, {estimated} with a doubtful estimate; of no use: {unused(results)}")
-    lines += _by_log(results)
+    unused = len(results) - len(of_use(results))
+    lines.append(f"of use: {len(good)} valid, {estimated} with a doubtful estimate; of no use: {unused}")
+    if len(logs := grouped(results, lambda r: r.log or "")) > 1:
+        lines += [
+            f"  {log}: {len(of)} windows, {sum(r.status is Status.VALID for r in of)} valid" for log, of in logs.items()
+        ]
     for (status, reason), group in by_reason(results):
         lines.append(f"  {len(group):5d} {status}" + ("" if reason == "none" else f": {reason}"))
         what = advice(group, good)
@@ -65,8 +69,7 @@ def summary_of(
     could_pull = [r for r in good if r.traversability.max_draft is not None]
     if any(r.traversability.state is State.UNKNOWN and r.excitation.draft is None for r in could_pull):
         lines.append("        no sensor shows the draft: no go, only what could be pulled (vehicle.towing)")
-    if no_slope:
-        lines.append(f"        {NO_SLOPE}")
+    lines += [f"        {unseen_slope}"] if unseen_slope else []
     lines.append("failed solves " + counted(Counter(r.failure for r in results if r.failure)))
     lines.append("solver ended by " + counted(Counter(r.termination for r in results if r.termination)))
     if ended := sum(r.search_ended for r in results):
@@ -91,11 +94,6 @@ def machine_line(results: Sequence[WindowResult]) -> str | None:
     return "of the machine: " + ", ".join(parts) + (f"; later than the torque: {', '.join(late)}" if late else "")
 
 
-def unused(results: Sequence[WindowResult]) -> int:
-    """Return the number of windows without an estimate of the soil."""
-    return len(results) - len(of_use(results))
-
-
 def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
     """Return one line on why no window, each `window` [s] long, has an estimate."""
     if not results:
@@ -111,16 +109,6 @@ def by_reason(results: Sequence[WindowResult]) -> list[tuple[tuple[str, str], li
     """Return the windows by status and reason, the most frequent first."""
     groups = grouped(results, lambda r: (str(r.status), r.reason))
     return sorted(groups.items(), key=lambda item: -len(item[1]))
-
-
-def _by_log(results: Sequence[WindowResult]) -> list[str]:
-    """A line for each of several logs."""
-    logs = grouped(results, lambda r: r.log or "")
-    if len(logs) < 2:
-        return []
-    return [
-        f"  {log}: {len(of)} windows, {sum(r.status is Status.VALID for r in of)} valid" for log, of in logs.items()
-    ]
 
 
 def counted(counts: Counter[str]) -> str:

@@ -160,26 +160,11 @@ def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Ar
 
 
 def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Array, Array, Array]:
-    """Bins between the samples of channels that are slower than the bins, on the line from sample to sample.
+    """Mean, mean time [s] and count (N, channels) with the bins between samples of slower channels filled by lines.
 
-    Parameters
-    ----------
-    mean, since, count
-        (N, channels), mean value, mean sample time [s] and number of samples of each bin.
-    centre
-        (N,) [s].
-
-    Returns
-    -------
-    mean, since, per_bin
-        The same, with the bins between two samples filled. The samples are shared among the bins: n samples are worth
-        no more than n.
-
-    Notes
-    -----
-    For channels of the vehicle only, whose mass lets them change slowly.  What a wheel does swings with its load at
-    1.5 to 3 Hz, so a wheel's bin holds what was measured in it or nothing.  One lost sample doubles the gap, so a gap
-    of more than one and a half times the channel's usual one stays empty.
+    The samples are shared among the bins: n samples are worth no more than n.  For channels of the vehicle only, whose
+    mass lets them change slowly: what a wheel does swings with its load at 1.5 to 3 Hz.  One lost sample doubles the
+    gap, so a gap of more than one and a half times the channel's usual one stays empty.
     """
     filled = count > 0.0
     n_filled = filled.sum(0)
@@ -202,22 +187,8 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
 
 
 def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:
-    """Bin means moved to the bins' centres along the slope between neighbouring bins.
+    """Bin means (N, channels) at the bins' centres [s], by the slope between neighbours, and the share they are worth.
 
-    Parameters
-    ----------
-    mean, since
-        (N, channels), mean value and mean sample time [s] of each bin.
-    centre
-        (N,) [s].
-
-    Returns
-    -------
-    mean, worth
-        (N, channels), the value at the centre, and the share of its samples that it is worth.
-
-    Notes
-    -----
     Messages of different phase have different mean times in a bin; a few ms matter where slip changes within a second.
     A shift by d bins multiplies the variance by 1 + d^2 / 2: the slope is between two neighbours with the same noise.
     """

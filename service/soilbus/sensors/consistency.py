@@ -37,7 +37,7 @@ from soilbus.estimation.window import (
 )
 from soilbus.sensors.bins import bin_means
 from soilbus.sensors.options import CONSISTENCY, ConsistencyOptions
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
+from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
 SAME = 1e-12
 """Relative difference of means of equal readings: rounding."""
@@ -82,13 +82,6 @@ class ConsistencyInput(NamedTuple):
         return max(round(self.options.comparison_time / self.bin), 1)
 
 
-class Checked(NamedTuple):
-    """A window without the channels that contradict the others, and which these are."""
-
-    window: Window
-    implausible: tuple[str, ...]
-
-
 class SensorConsistency:
     """Checks whether sensors contradict each other; it keeps the speeds of the motors for that."""
 
@@ -109,13 +102,12 @@ class SensorConsistency:
             if found := samples.get(f"{MOTOR_SPEED}.{wheel}"):
                 heard.append(found)
 
-    def checked(self, window: Window) -> Checked:
-        """Return a forward window without the channels that contradict the others."""
+    def checked(self, window: Window) -> tuple[Window, tuple[str, ...]]:
+        """Return a forward window without the channels that contradict the others, and which these are."""
         s = self._settings
-        names = implausible(
-            window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, self._motor_speed(window)
-        )  # fmt: skip
-        return Checked(without(window, self._rig, set(names)), names)
+        motor = self._motor_speed(window)
+        names = implausible(window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, motor)
+        return without(window, self._rig, set(names)), names
 
     def drop_before(self, t: float) -> None:
         """Forget the speeds of the motors before t [s]."""
@@ -306,7 +298,9 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
     if chassis is None or set(rig.front.tolist()) != {True, False}:
         return
     weight = chassis.mass * GRAVITY
-    excess = _axle_excess(window, rig, chassis) / weight
+    draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
+    due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
+    excess = (window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1) - due) / weight
     total = excess.sum(axis=1)
     with np.errstate(invalid="ignore"):
         wrong = data.driving & (np.abs(total) > options.load_error)
@@ -327,13 +321,6 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
         if abs(left - other) > options.load_error:
             heavier = 0 if left > other else 1
             yield f"load.{rig.wheels[bad[heavier if front + rear > 0.0 else 1 - heavier]]}"
-
-
-def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
-    """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
-    draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
-    due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
-    return np.asarray(window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1) - due)
 
 
 def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
@@ -423,7 +410,8 @@ def speed_scale(data: ConsistencyInput) -> Iterator[str]:
         return
     if not lasts(wrong, data.sustained):
         return
-    factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
+    within = np.convolve(wrong, np.ones(n)) > 0.0  # in the stretches of n instants that begin there
+    factor, seen = median(scale[wrong]), median(data.slip[lag:][within])
     if not 1.0 - (1.0 - seen) / factor < -options.feigned_slip:
         yield "ground_speed"
     if not seen < -options.feigned_slip:
@@ -457,12 +445,6 @@ def _stretches(length: int, n: int) -> Array:
     first = np.arange(length - n + 1)
     place = np.arange(length)[:, None]
     return np.asarray((place >= first) & (place < first + n), float)
-
-
-def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
-    """Median slip in the stretches of n of these instants (N, W) that begin where the mask (N - n + 1,) says."""
-    within = np.convolve(begins, np.ones(n)) > 0.0
-    return median(slip[within])
 
 
 def _jumps(data: ConsistencyInput) -> bool:

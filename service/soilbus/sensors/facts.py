@@ -11,19 +11,15 @@ import numpy as np
 from soilbus.arrays import Array, Mask
 from soilbus.config.model import Config
 from soilbus.estimation.window import Rig, Window
-from soilbus.sensors.consistency import without
+from soilbus.sensors.consistency import change, without
 from soilbus.terra.vehicle import slip_ratio
-
-__all__ = ["LIMITS", "Facts", "Finding", "UndecidableError", "block_means", "regression", "spread", "steps"]
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
     """Thresholds from which a recording contradicts its configuration.
 
-    Evidence, where not given: three recordings of the field vehicle and simulated drives on loam, wet clay, heavy clay
-    and sand gave loads of 0.997 to 1.002 of the weight, axles within 0.004 of it, slopes of the balance of 0.72 to
-    1.01, slips of 5 % of the time of 0.06 to 0.14, and slips of wheels within 0.04 of each other.
+    Where nothing else is said, recordings of the field vehicle and simulated drives stay well within them.
     """
 
     least_seconds: float = 10.0
@@ -37,8 +33,8 @@ class Limits:
     instant: float = 1.5
     """Samples of a wheel's channel in a bin below which the bin holds a value of one instant."""
     mean_of: float = 3.0
-    """Samples of another channel in the same bin from which they are a mean.  Behind differentials, with loads that
-    shake, 65 % of the intervals of n held where both stood side by side, 95 % in shorter bins (loam, 40 drives)."""
+    """Samples of another channel in the same bin from which they are a mean: with loads that shake the two then
+    differ."""
     weight: float = 0.15
     """Share of the weight by which the loads may differ (fuel, driver, freight); half of it is a warning."""
     axle: float = 0.12
@@ -47,7 +43,7 @@ class Limits:
     """Relative difference of motor and wheel speed, due to resolution and phase; any other gear step is larger."""
     locked: float = 0.015
     """Median difference of two wheel speeds over their mean, from which no shaft connects them: each sensor's noise and
-    gain error are 0.003 and 0.002 (`noise.speed`); behind an open differential a simulated drive on loam has 0.06."""
+    gain error are 0.003 and 0.002 (`noise.speed`)."""
     pushed: float = -0.2
     """Least median slip of driving wheels."""
     never_less: float = 0.45
@@ -56,15 +52,13 @@ class Limits:
     """Difference of one wheel's median slip from the median of all."""
     free: float = 0.25
     """Largest median slip, either way, of a wheel that rolls freely: wheels towed through soft soil skid by 0.1 to 0.2
-    (Wong 2008, ch. 4); simulated ones on loam by 0.02. None drives: above `idle_slip` its radius is in doubt."""
+    (Wong 2008, ch. 4). None drives: above `idle_slip` its radius is in doubt."""
     transfer: float = 0.75
-    """Least share of the load transfer by moments: 0 where a front and a rear cell are swapped, -1 where both are.  The
-    field vehicle has 1.2 +- 0.1 (on clay, where the draft hardly changes, 2.3 +- 0.5), a simulated drive 1.00."""
+    """Least share of the load transfer by moments: 0 where a front and a rear cell are swapped, -1 where both are."""
     scale: tuple[float, float] = (0.6, 1.3)
     """Range of the regression slope of thrust on draft."""
     turn: float = 0.5
-    """Relative difference [1] of an axle's speeds from yaw rate times track that still is a turn's, not a spin's: of 17
-    logs of a rover on snow two were refused without it, for the sign of a yaw rate that is right."""
+    """Relative difference [1] of an axle's speeds from yaw rate times track that still is a turn's, not a spin's."""
     excited: float = 0.008
     """Sd of the draft's changes within 1 s, or of an axle's thrust, as a share of the weight, below which the balance
     or the slip cannot be decided."""
@@ -76,8 +70,7 @@ class Limits:
     """Largest median thrust over weight that soil can bear for long."""
     least_slip: float = 0.03
     """Slip [1] that comes with a thrust of the load, at least. Cars on dry asphalt have as much (Gustafsson 1997,
-    Automatica 33:1087), multibody tractors 0.25 to 2, the field vehicle 1 to 4, a speed computed from an axle's wheels
-    -0.02 to 0.01 +- 0.01."""
+    Automatica 33:1087), tractors 0.25 and more, a speed computed from an axle's wheels none."""
     tilted: float = 0.004
     """Sd of the slope [rad] from which it shows whether an accelerometer feels gravity: four times the sensor's own
     noise (`noise.pitch`)."""
@@ -88,8 +81,8 @@ class Limits:
     side_sd: float = 4.0
     """Standard deviations by which a regression coefficient must have the wrong sign, or lie outside `scale`."""
     side_torque: float = 0.05
-    """Sd of the difference of an axle's torques, over their mean, below which it tells nothing of load and slip: motors
-    that are given the same torque have 0.002 to 0.02 in multibody drives, the field vehicle 0.16."""
+    """Sd of the difference of an axle's torques, over their mean, below which it tells nothing of load and slip: the
+    motors are then given the same torque."""
     side_offset: float = 0.3
     """Constant difference of the torques of an axle, as a share of their mean."""
     jump: float = 0.3
@@ -165,6 +158,21 @@ def steps(facts: Facts) -> tuple[int, int]:
     """Return the bins over which changes are compared (a second) and averaged (half a second)."""
     bin_length = facts.config.estimator.bin
     return max(round(1.0 / bin_length), 1), max(round(0.5 / bin_length), 1)
+
+
+def changes(facts: Facts, *columns: Array, least: float | None = None) -> Array | None:
+    """Return the changes (N, K) of K columns over a second, in means over half a second, where all are known.
+
+    None where fewer than `least` bins are known, by default those of 20 s.
+    """
+    lag, block = steps(facts)
+    return settled(np.stack([change(column, lag) for column in columns], axis=1), block, least)
+
+
+def settled(rows: Array, block: int, least: float | None = None) -> Array | None:
+    """Return the means (N, K) of each `block` known rows; None where fewer than `least` (40 blocks) are known."""
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    return block_means(rows, block) if len(rows) >= (40 * block if least is None else least) else None
 
 
 def spread(values: Array) -> float:

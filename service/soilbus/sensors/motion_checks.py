@@ -21,10 +21,8 @@ from soilbus.arrays import Array
 from soilbus.estimation.window import forward, pairs, pull_given
 from soilbus.grouping import grouped
 from soilbus.sensors.consistency import change, median, moving_sum
-from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, block_means, regression, steps
+from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, changes, regression, settled, steps
 from soilbus.terra.vehicle import GRAVITY
-
-__all__ = ["MOTION_CHECKS"]
 
 
 def _wheel_based(facts: Facts) -> Iterator[Finding]:
@@ -36,11 +34,10 @@ def _wheel_based(facts: Facts) -> Iterator[Finding]:
     for axle, own in _driven_axles(facts).items():
         carried = median(facts.window.load[:, own].sum(axis=1))
         rows = np.stack([facts.slip[:, own].mean(axis=1), facts.thrust[:, own].sum(axis=1) / carried], axis=1)
-        rows = rows[np.isfinite(rows).all(axis=1)]
-        if len(rows) < 2 * LIMITS.least_seconds * second:
+        means = settled(rows, second, 2 * LIMITS.least_seconds * second)
+        if means is None:
             continue
-        rows = block_means(rows, second)
-        slip, thrust = (rows - rows.mean(axis=0)).T
+        slip, thrust = (means - means.mean(axis=0)).T
         (per_thrust,), (sd,) = regression(slip, thrust[:, None])
         if thrust.std() > LIMITS.excited and per_thrust + LIMITS.side_sd * sd < LIMITS.least_slip:
             yield Finding(
@@ -87,26 +84,22 @@ def _changes(facts: Facts) -> Array | None:
     slope = GRAVITY * np.sin(window.pitch) if "pitch" in facts.mapped else np.zeros(len(window.t))
     summed = [facts.config.estimator.bin * moving_sum(a, lag) for a in (forward(facts.raw).acceleration, slope)]
     gained = change(np.where(facts.straight, window.ground_speed, np.nan), lag)
-    rows = np.stack([summed[0], gained, summed[1]], axis=1)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 40 * block:
-        return None
-    rows = block_means(rows, block)
-    return np.asarray(rows - rows.mean(axis=0))  # a constant offset is no scale
+    rows = settled(np.stack([summed[0], gained, summed[1]], axis=1), block)
+    return None if rows is None else np.asarray(rows - rows.mean(axis=0))  # a constant offset is no scale
 
 
-def _felt(changes: Array) -> Felt:
-    (of_speed, of_slope), (speed_sd, slope_sd) = regression(changes[:, 0], changes[:, 1:])
-    return Felt(float(of_speed), float(of_slope), float(speed_sd), float(slope_sd), float(changes[:, 2].std()))
+def _felt(rows: Array) -> Felt:
+    (of_speed, of_slope), (speed_sd, slope_sd) = regression(rows[:, 0], rows[:, 1:])
+    return Felt(float(of_speed), float(of_slope), float(speed_sd), float(slope_sd), float(rows[:, 2].std()))
 
 
 def _accelerometer(facts: Facts) -> Iterator[Finding]:
     """Scale and kind of the accelerometer; scale and sign of the pitch that it feels."""
-    changes = _changes(facts)
-    if changes is None:
+    rows = _changes(facts)
+    if rows is None:
         return
-    felt, most = _felt(changes), LIMITS.scale[1]
-    (back, _), (back_sd, _) = regression(changes[:, 1], changes[:, [0, 2]])
+    felt, most = _felt(rows), LIMITS.scale[1]
+    (back, _), (back_sd, _) = regression(rows[:, 1], rows[:, [0, 2]])
     size = felt.of_speed if felt.of_speed - LIMITS.side_sd * felt.speed_sd > most else 0.0
     if not size and back - LIMITS.side_sd * back_sd > most:
         size = 1.0 / float(back)
@@ -117,9 +110,7 @@ def _accelerometer(facts: Facts) -> Iterator[Finding]:
             ("acceleration",),
         )
         return
-    if "pitch" not in facts.mapped or facts.config.signals.acceleration is None:
-        return
-    if not felt.shows_slope:
+    if "pitch" not in facts.mapped or facts.config.signals.acceleration is None or not felt.shows_slope:
         return
     margin, is_force = LIMITS.side_sd * felt.slope_sd, facts.config.signals.acceleration.kind == "specific_force"
     if felt.of_slope < -margin:
@@ -145,13 +136,11 @@ def _slope(facts: Facts) -> Iterator[Finding]:
     window, chassis = facts.window, facts.rig.chassis
     if chassis is None or "pitch" not in facts.mapped or not np.isfinite(window.pitch).any():
         return
-    weight, (lag, block) = chassis.mass * GRAVITY, steps(facts)
-    thrust, uphill = facts.thrust.sum(axis=1), weight * np.sin(window.pitch)
-    rest = pull_given(window, chassis) - uphill
-    rows = np.stack([change(a, lag) for a in (thrust, uphill, rest)], axis=1)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 40 * block or (x := block_means(rows, block))[:, 1].std() < LIMITS.excited * weight:
-        if (changes := _changes(facts)) is not None and _felt(changes).shows_slope:
+    weight = chassis.mass * GRAVITY
+    uphill = weight * np.sin(window.pitch)
+    x = changes(facts, facts.thrust.sum(axis=1), uphill, pull_given(window, chassis) - uphill)
+    if x is None or x[:, 1].std() < LIMITS.excited * weight:
+        if (felt := _changes(facts)) is not None and _felt(felt).shows_slope:
             return  # the accelerometer says it
         kind = " and the kind of signals.acceleration" if "acceleration" in facts.mapped else ""
         raise UndecidableError(

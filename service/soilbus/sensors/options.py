@@ -26,19 +26,15 @@ class ReceptionOptions:
     """Share [1] of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise."""
 
     timeout: float = 1.0
-    """Age [s] from which a channel without a configured time-out is stale.  0.7 and 1.3 s: one window less and none
-    more has data enough."""
+    """Age [s] from which a channel without a configured time-out is stale."""
     covered_block: float = 0.5
-    """Time [s] of a block that counts as covered if it has a sample.  0.35 and 0.65 s: 10 and 3 windows less have data
-    enough."""
+    """Time [s] of a block that counts as covered if it has a sample."""
     min_coverage: float = 0.95
-    """Share [1] of a window's blocks that a needed channel must cover.  With 0.67 27 windows more have data enough,
-    which miss a third of a channel."""
+    """Share [1] of a window's blocks that a needed channel must cover."""
     limit_samples: int = 3
     """Number of reported torque limits whose median is in force: one outlier does not change it."""
     fix_smoothing: float = 1.0
-    """Time [s] before and after, within which fixes are averaged: receivers are noisy.  0.7 and 1.3 s give the same
-    positions within a metre."""
+    """Time [s] before and after, within which fixes are averaged: receivers are noisy."""
 
 
 RECEPTION = ReceptionOptions()
@@ -55,23 +51,22 @@ class ConsistencyOptions:
 
     contradiction_time: float = 1.0
     """Time [s] for which a contradiction must last, and over which values change; half of it is the longest delay
-    between speed and acceleration.  0.7 and 1.3 s: one fault more of 81 is found."""
+    between speed and acceleration."""
     significant_sd: float = 5.0
     """Standard deviations [1] by which a change must stand out of the noise, and the probability below which noise
-    leaves equal readings.  30 % either way finds the same faults."""
+    leaves equal readings."""
     repeated_share: float = 0.1
-    """Share [1] of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen.
-    30 % either way finds the same faults."""
+    """Share [1] of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not
+    frozen."""
 
     still_share: float = 0.1
-    """Rim speed over ground speed [1] below which a wheel does not turn.  30 % either way finds the same faults."""
+    """Rim speed over ground speed [1] below which a wheel does not turn."""
     idle_traction: float = 0.01
     """Traction [1] of a wheel that drives nothing: any soil resists more."""
     driving_traction: float = 0.15
-    """Traction [1] of a wheel that surely drives.  0.105: 1 fault more; 0.195: 1 sound sensor less is named."""
+    """Traction [1] of a wheel that surely drives."""
     gear_slack: float = 0.03
-    """Relative difference [1] of motor and wheel speed that gear and radius of the wheel's sensor may have.  30 %
-    either way finds the same faults."""
+    """Relative difference [1] of motor and wheel speed that gear and radius of the wheel's sensor may have."""
     feigned_slip: float = 0.12
     """Slip [1] that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
 
@@ -83,25 +78,19 @@ class ConsistencyOptions:
     """Share [1] of the weight by which the loads' sum must be wrong, and of an axle's load by which its left and right
     must differ more than the other axle's for one to be named; lost zeros and what is carried stay below it."""
     any_load: float = 0.6
-    """Wrong share [1] of the weight that nothing carried explains, so that all load cells are wrong.  0.42: 5 sound
-    sensors more are named."""
+    """Wrong share [1] of the weight that nothing carried explains, so that all load cells are wrong."""
 
     comparison_time: float = 3.0
     """Time [s] over which changes of two quantities are compared: at the border of a soft soil a driver who lifts the
-    implement may pull less and drive more for a moment.  2.1 s: 1 sound sensor more is named, 3.9 s: 1 fault less is
-    found."""
+    implement may pull less and drive more for a moment."""
     usual_share: float = 0.9
-    """Share [1] of these changes that must be known, and of significant ones that go the wrong way.  Nearly 1: 22
-    faults less are found."""
+    """Share [1] of these changes that must be known, and of significant ones that go the wrong way."""
     correlation: float = 0.985
-    """Correlation [1] from which speed and acceleration go together at some delay.  Nearly 1: 15 faults less are
-    found."""
+    """Correlation [1] from which speed and acceleration go together at some delay."""
     scale_ratio: float = 1.35
-    """Ratio [1] of their changes from which they contradict each other.  1: 85 sound sensors more are named; 1.76: 14
-    faults less are found."""
+    """Ratio [1] of their changes from which they contradict each other."""
     jump_explained: float = 0.25
-    """Share [1] of a jump of the ground speed that the acceleration about it explains, at most; with 0.74, five of
-    fifteen faults of the accelerometer are taken for jumps (`tests.lab.sensitivity`)."""
+    """Share [1] of a jump of the ground speed that the acceleration about it explains, at most."""
 
 
 CONSISTENCY = ConsistencyOptions()

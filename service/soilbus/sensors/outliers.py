@@ -53,16 +53,10 @@ class Samples(NamedTuple):
         return ordered
 
 
-class Tested(NamedTuple):
-    """Samples in order, which of them are outliers, and how many of their channel follow each one; each (N,)."""
-
-    samples: Samples
-    outlier: Mask
-    later: NDArray[np.intp]
-
-
-def outlier_test(samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION) -> Tested:
-    """Find the outliers among samples in any order.
+def outlier_test(
+    samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION
+) -> tuple[Samples, Mask, NDArray[np.intp]]:
+    """Return samples in order, which of them are outliers, and how many of their channel follow each one; each (N,).
 
     A channel with fewer than nine samples is not judged; the first and last four of the
     others are judged by the line nearest to them.
@@ -77,7 +71,7 @@ def outlier_test(samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION
     later -= here + 1
     outlier = np.zeros(n, bool)
     if n < SPAN:
-        return Tested(samples, outlier, later)
+        return samples, outlier, later
     line = np.maximum(here - SIDE, np.repeat(end - count, count))
     np.minimum(line, np.repeat(np.maximum(end - SPAN, 0), count), out=line)
     slope, level, when = _lines(t, value).take(line, axis=1)
@@ -92,7 +86,7 @@ def outlier_test(samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION
         scatter = _vibration(value, noise, end - count, end, column[far]) * noise[far]
         np.maximum(limit, options.outlier_sd * scatter, out=limit)
         outlier[far] = off[far] > limit
-    return Tested(samples, outlier, later)
+    return samples, outlier, later
 
 
 def _lines(t: Array, value: Array) -> Array:

@@ -43,15 +43,6 @@ class _Channel(NamedTuple):
     needed: bool
 
 
-class _Binned(NamedTuple):
-    """Bins (B,) with samples: number of the bin and of its samples, value at the centre, samples it is worth."""
-
-    bins: NDArray[np.intp]
-    samples: Array
-    value: Array
-    worth: Array
-
-
 def resolved_window(store: Bins, end: float) -> Window:
     """Return all samples of a store from its origin to `end`, in bins as short as its spectrum asks for.
 
@@ -82,10 +73,10 @@ def resolved_window(store: Bins, end: float) -> Window:
     worth, counted = np.zeros(mean.shape), 0
     centre: Array = store.origin + (np.arange(n, dtype=np.float64) + 0.5) * length
     for channel in channels:
-        found = _binned(channel, length, n)
-        at = found.bins, channel.column
-        mean[at], worth[at] = found.value, found.worth
-        counted += int(found.samples.sum())
+        bins, samples_of, value, worth_of = _binned(channel, length, n)
+        at = bins, channel.column
+        mean[at], worth[at] = value, worth_of
+        counted += int(samples_of.sum())
     return replace(made_window(noise, centre, mean, worth, counted), curves=curves)
 
 
@@ -110,12 +101,12 @@ def _bin_length(channels: Iterable[_Channel], longest: float, span: float, max_l
 
 def _lost(channel: _Channel, length: float, n: int) -> float:
     """Share of the samples lost by taking values at the centres."""
-    found = _binned(channel, length, n)
-    return 1.0 - float(found.worth.sum() / found.samples.sum()) if len(found.bins) else 0.0
+    bins, samples, _, worth = _binned(channel, length, n)
+    return 1.0 - float(worth.sum() / samples.sum()) if len(bins) else 0.0
 
 
-def _binned(channel: _Channel, length: float, n: int) -> _Binned:
-    """The bins 0..n-1 of this length from time 0 on that have samples."""
+def _binned(channel: _Channel, length: float, n: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
+    """Of the bins 0..n-1 from time 0 on that have samples (B,): number, samples, value at the centre, their worth."""
     number = np.floor(channel.t / length + 1e-9).astype(np.intp)
     kept = (number >= 0) & (number < n)
     t, number = channel.t[kept], number[kept]
@@ -134,4 +125,4 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
         kinds, which = np.unique(np.stack([count.astype(int), phase]), axis=1, return_inverse=True)
         of_kind = [1.0 / variance_of_one(channel.curve.half_width, *kind) for kind in kinds.T.tolist()]
         worth = np.minimum(np.array(of_kind)[which.ravel()], count)
-    return _Binned(bins, count, rest + channel.curve.at(centre)[0], worth)
+    return bins, count, rest + channel.curve.at(centre)[0], worth

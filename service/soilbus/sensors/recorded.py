@@ -10,10 +10,9 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.can.admission import LONGEST_GAP, Admission
+from soilbus.can.candump import Frame
 from soilbus.can.channels import Reason
 
-Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
-"""Time [s], identifier, extended, data, remote, error."""
 Columns = dict[str, tuple[Array, Array]]
 """Times [s] and values (SI) by channel name."""
 
@@ -22,7 +21,7 @@ BATCH_SIZE = 5000
 
 
 def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns, Counter[tuple[str, Reason]], int]:
-    """Return the samples of the longest part, and refused values and number of frames of all parts.
+    """Return the samples of the longest part with one clock, and refused values and number of frames of all parts.
 
     Parameters
     ----------
@@ -31,12 +30,6 @@ def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns
     frames
         Of one recording.
     """
-    parts, refused, n = _parts(admission, frames)
-    return max(parts, key=lambda part: sum(len(t) for t, _ in part.values())), refused, n
-
-
-def _parts(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
-    """Samples by channel for each part of the recording with one clock, refusals, and the number of frames."""
     pieces: list[list[Columns]] = [[]]
     refused: Counter[tuple[str, Reason]] = Counter()
     last, n, steps = math.nan, 0, 0
@@ -61,7 +54,8 @@ def _parts(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns]
                 pieces.append([])
             take()
     take()
-    return [_joined(piece) for piece in pieces], refused, n
+    parts = [_joined(piece) for piece in pieces]
+    return max(parts, key=lambda part: sum(len(t) for t, _ in part.values())), refused, n
 
 
 def _joined(pieces: list[Columns]) -> Columns:

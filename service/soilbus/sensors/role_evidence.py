@@ -19,14 +19,15 @@ from cantools.database.can import Database
 
 from soilbus.arrays import Array
 from soilbus.can.admission import Admission
+from soilbus.can.candump import Frame
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import check_decodable
 from soilbus.can.role_matching import ASSERTED, WHEELS, Assignment, Candidate, Slot, axles_of
 from soilbus.can.units import STANDARD_GRAVITY
+from soilbus.sensors.bins import bin_means
+from soilbus.sensors.consistency import median
 from soilbus.sensors.facts import LIMITS
-from soilbus.sensors.recorded import Columns, Frame, longest_part
-
-__all__ = ["Facts", "Recording", "facts_of", "recording_of", "weighed"]
+from soilbus.sensors.recorded import Columns, longest_part
 
 BIN = 0.2
 """Time [s] over which samples are averaged before they are compared: a few frames of each sensor."""
@@ -35,9 +36,8 @@ LEAST_BINS = 50
 MOVING = 0.2
 """Ground speed [m/s] from which the vehicle moves: `estimator.min_speed`."""
 RIGID = 0.006
-"""Relative sd of the ratio of two speeds up to which they belong to parts that turn together.  Three simulated
-machines, five soils and the field vehicle gave 0.000 to 0.0024 for motor over wheel, 0.07 to 0.25 for ground speed
-over wheels."""
+"""Relative sd of the ratio of two speeds up to which they belong to parts that turn together; slip has ten times as
+much."""
 SAME_GEAR = 0.02
 """Relative difference of two measured gear ratios up to which they are one: gain errors; gear steps are larger."""
 ABSENT, REFUSED = 0.9, 0.6
@@ -61,8 +61,7 @@ class Recording:
     def mean(self, path: str, edges: Array) -> Array:
         """Return the means over the bins between edges [s]; nan where there is no sample."""
         t, value = self.columns.get(path, (np.empty(0), np.empty(0)))
-        count, total = np.histogram(t, edges)[0], np.histogram(t, edges, weights=value)[0]
-        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+        return bin_means(t, value, edges[0], BIN, len(edges) - 1) if len(edges) else np.empty(0)
 
     @property
     def edges(self) -> Array:
@@ -146,7 +145,7 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
     moving = np.abs(ground) > MOVING
     if moving.sum() < LEAST_BINS:
         moving = np.ones(len(ground), bool)
-    forward = _one(np.sign(ground))
+    forward = np.where(np.isfinite(ground), np.sign(ground), 1.0)
     axles = axles_of(assignment)
     wheels = [wheel for pair in axles.values() for wheel in pair]
     speed = {w: read("speed", w) for w in wheels}
@@ -154,19 +153,24 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
     cells = [places for places in (wheels, list(axles)) if all(Slot("load", p) in asserted for p in places)]
     facts = Facts(
         kind=_kind(read("acceleration"), ground, read("pitch")),
-        mass=_median(np.sum([read("load", p) for p in cells[0]], axis=0)) / STANDARD_GRAVITY if cells else math.nan,
+        mass=median(np.sum([read("load", p) for p in cells[0]], axis=0)) / STANDARD_GRAVITY if cells else math.nan,
         axle=_driven_axle(read("motor_speed")[moving], {axle: speed[axle][moving] for axle in axles}),
     )
     for place, wheel in speed.items():
         own = "" if place == facts.axle else place
         motor = read("motor_speed", own if Slot("motor_speed", own) in asserted else place)
-        first = axles[place][0] if place in axles else place
-        _gear(facts, assignment.asserted.get(Slot("speed", first)), place, motor[moving], wheel[moving])
+        of_wheel = asserted.get(Slot("speed", axles[place][0] if place in axles else place))
+        if of_wheel is not None and _scatter(motor[moving], wheel[moving]) < 5.0 * RIGID:
+            ratios = facts.gear_ratio if of_wheel.dimension == "rotation" else facts.per_metre
+            _keep(ratios, place, np.abs(motor[moving] / wheel[moving]))
         own_speed = asserted.get(Slot("speed", place))
         if own_speed is not None and own_speed.dimension == "rotation":
             turning = moving & (wheel != 0.0)
             _keep(facts.radius, place, np.abs(ground[turning] / wheel[turning]))
-    _pool(facts.gear_ratio)
+    of_wheels = {place: ratio for place, ratio in facts.gear_ratio.items() if place in WHEELS}
+    if of_wheels and max(of_wheels.values()) < (1.0 + SAME_GEAR) * min(of_wheels.values()):
+        # gears of one kind on all wheels: the median is free of each sensor's gain error
+        facts.gear_ratio.update(dict.fromkeys(of_wheels, float(np.median([*of_wheels.values()]))))
     for slot, c in asserted.items():
         if slot.role in ("speed", "motor_speed", "torque"):
             _sign(facts, c, (read(*slot) * forward)[moving])
@@ -190,7 +194,7 @@ def _turning(found: Iterable[Candidate], recording: Recording) -> Array:
     }
     edges = recording.edges
     parts = [recording.mean(path, edges) for path in paths]
-    scaled = [part / size for part in parts if (size := _median(np.abs(part))) > 0.0]
+    scaled = [part / size for part in parts if (size := median(np.abs(part))) > 0.0]
     return np.asarray(np.mean(scaled, axis=0)) if scaled else np.full(max(len(edges) - 1, 0), np.nan)
 
 
@@ -209,20 +213,8 @@ def _as_ground_speed(c: Candidate, recording: Recording, turning: Array) -> Cand
     return c
 
 
-def _gear(facts: Facts, own: Candidate | None, place: str, motor: Array, wheel: Array) -> None:
-    if own is not None and _scatter(motor, wheel) < 5.0 * RIGID:
-        _keep(facts.gear_ratio if own.dimension == "rotation" else facts.per_metre, place, np.abs(motor / wheel))
-
-
-def _pool(ratios: dict[str, float]) -> None:
-    """Gears of one kind on all wheels have one ratio: its median, free of each sensor's gain error."""
-    wheels = {place: ratio for place, ratio in ratios.items() if place in WHEELS}
-    if wheels and max(wheels.values()) < (1.0 + SAME_GEAR) * min(wheels.values()):
-        ratios.update(dict.fromkeys(wheels, float(np.median([*wheels.values()]))))
-
-
 def _sign(facts: Facts, c: Candidate, value: Array) -> None:
-    if np.isfinite(value).sum() >= LEAST_BINS and _median(np.sign(value)) < 0.0:
+    if np.isfinite(value).sum() >= LEAST_BINS and median(np.sign(value)) < 0.0:
         facts.backward[c.path] = f"{np.mean(value[np.isfinite(value)] < 0.0):.0%} of the drive"
 
 
@@ -265,19 +257,9 @@ def _scatter(one: Array, other: Array) -> float:
 
 
 def _keep(into: dict[str, float], place: str, values: Array) -> None:
-    if math.isfinite(value := _median(values)):
+    if math.isfinite(value := median(values)):
         into[place] = value
-
-
-def _one(values: Array) -> Array:
-    """Values, 1 where they are not known."""
-    return np.where(np.isfinite(values), values, 1.0)
 
 
 def _smooth(values: Array, width: int) -> Array:
     return np.convolve(values, np.full(width, 1.0 / width), "same") if len(values) >= width else values
-
-
-def _median(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else math.nan

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +17,12 @@ from cantools.database.can import Database, Message
 
 from soilbus.arrays import Array
 from soilbus.can.admission import Admission, Counts
+from soilbus.can.candump import Frame
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.doubts import MEANING
-from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of, found_signal
-from soilbus.can.units import SI, unit_of
+from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of, found_signal, si_unit
+from soilbus.can.units import unit_of
 from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
@@ -30,7 +32,7 @@ from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import implausible, resolution_of
 from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError
 from soilbus.sensors.motion_checks import MOTION_CHECKS
-from soilbus.sensors.recorded import Columns, Frame, longest_part
+from soilbus.sensors.recorded import Columns, longest_part
 from soilbus.sensors.vehicle_checks import VEHICLE_CHECKS
 
 MAX_LISTED = 4
@@ -54,11 +56,6 @@ class Seen:
     def unit(self) -> str:
         """SI unit of its values; "" of a code."""
         return si_unit(self.channel)
-
-
-def si_unit(channel: Channel) -> str:
-    """Return the SI unit of a channel's values; "" of a code."""
-    return "" if channel.quantity == LOCK else SI.get(_dimension(channel), "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +140,7 @@ def _with_motor_speeds(config: Config, database: Database) -> list[object]:
             name = wheel.torque.signal.partition(".")[0]
             message = next((m for m in database.messages if m.name == name), None)
             taken = {getattr(wheel, role).signal for role in ("torque", "speed") if getattr(wheel, role) is not None}
-            turns = [s for s in message.signals if _rotation(s.unit)] if message is not None else []
+            turns = [s for s in message.signals if _dimension(s.unit) == "rotation"] if message is not None else []
             if len(turns) == 1 and f"{name}.{turns[0].name}" not in taken:
                 signal = Signal(signal=f"{name}.{turns[0].name}", sign=wheel.torque.sign)
                 wheel = wheel.model_copy(update={"motor_speed": signal})
@@ -151,17 +148,11 @@ def _with_motor_speeds(config: Config, database: Database) -> list[object]:
     return wheels
 
 
-def _rotation(text: str | None) -> bool:
-    try:
-        unit = unit_of(text)
-    except ValueError:
-        return False
-    return unit is not None and unit.dimension == "rotation"
-
-
-def _is_in_metres(signal: Signal, database: Database) -> bool:
-    unit = unit_of(found_signal(database, signal.signal)[1].unit)
-    return unit is not None and unit.dimension == "speed"
+def _dimension(unit: str | None) -> str:
+    """The dimension of a unit's text; "" of none that is known."""
+    with suppress(ValueError):
+        return known.dimension if (known := unit_of(unit)) is not None else ""
+    return ""
 
 
 def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
@@ -196,7 +187,11 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns, database: Data
     shaft = {name: bin_means(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
     moving = np.abs(window.ground_speed) > config.estimator.min_speed
     straight = moving & ~turning(window, rig, config.estimator.max_turn)
-    by_radius = frozenset(w.name for w in config.wheel if w.speed is not None and _is_in_metres(w.speed, database))
+    by_radius = frozenset(
+        w.name
+        for w in config.wheel
+        if w.speed is not None and _dimension(found_signal(database, w.speed.signal)[1].unit) == "speed"
+    )
     return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped), by_radius)
 
 
@@ -234,7 +229,12 @@ def _absent(seen: Iterable[Seen], database: Database, counts: Counts) -> Iterato
         message = database.get_message_by_name(name)
         where = f"{'29' if message.is_extended_frame else '11'}-bit identifier {message.frame_id:#x}"
         keys = ", ".join(channel.key for channel in channels)
-        text = f"{keys}: no frame of {name} ({where}) was heard{_elsewhere(message, counts)}"
+        text = f"{keys}: no frame of {name} ({where}) was heard"
+        if heard := counts.unknown_of_group(message.frame_id) if message.is_extended_frame else []:
+            shown = ", ".join(f"{identifier:#x}" for identifier in heard[:MAX_LISTED]) + ", ..." * (
+                len(heard) > MAX_LISTED
+            )
+            text += f", but {shown} of its parameter group: {OTHER_SENDER}"
         signals = dict.fromkeys(channel.signal for channel in channels)
         if counts.received[name] and all(_is_of_a_page(message, signal) for signal in signals):
             text = f"{keys}: {name} was heard, but never the page of its multiplexer that holds {', '.join(signals)}"
@@ -244,15 +244,6 @@ def _absent(seen: Iterable[Seen], database: Database, counts: Counts) -> Iterato
 def _is_of_a_page(message: Message, signal: str) -> bool:
     """Whether a multiplexer says which frames hold a signal."""
     return message.get_signal_by_name(signal).multiplexer_signal is not None
-
-
-def _elsewhere(message: Message, counts: Counts) -> str:
-    """What was heard of a message's parameter group under other identifiers."""
-    heard = counts.unknown_of_group(message.frame_id) if message.is_extended_frame else []
-    if not heard:
-        return ""
-    shown = ", ".join(f"{identifier:#x}" for identifier in heard[:MAX_LISTED]) + ", ..." * (len(heard) > MAX_LISTED)
-    return f", but {shown} of its parameter group: {OTHER_SENDER}"
 
 
 def _of_several_senders(channels: Iterable[Channel], counts: Counts) -> Iterator[Finding]:
@@ -277,8 +268,8 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
     share = refused / (refused + seen.count)
     said = {max(seen.refused, key=lambda reason: seen.refused[reason])} if share > LIMITS.refused else set()
     for reason in sorted(said | ({Reason.SECOND_SENDER} & seen.refused.keys())):
-        n, unit = seen.refused[reason], SI.get(_dimension(channel), "")
-        why = _REFUSAL.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
+        n, why = seen.refused[reason], _REFUSAL.get(reason, str(reason).replace("_", " "))
+        why = why.format(low=channel.low, high=channel.high, unit=seen.unit)
         text = f"{key}: {n} of {refused + seen.count} values of {channel.path} do not count: {why}"
         yield Finding(text, share > 4.0 * LIMITS.refused, (channel.name,) if share > 4.0 * LIMITS.refused else ())
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
@@ -288,15 +279,6 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
             yield Finding(f"{key}: {seen.rate:.3g} values a second, where the DBC says {due:.3g}", False)
         elif seen.rate < LIMITS.least_rate and not _is_optional(seen):
             yield Finding(f"{key}: only {seen.rate:.3g} values a second; windows need {LIMITS.least_rate:g}", False)
-
-
-def _dimension(channel: Channel) -> str:
-    of_quantity = {
-        "torque": "torque", "torque_limit": "torque", "speed": "rotation", "motor_speed": "rotation", "load": "force",
-        "draft": "force", "sinkage": "length", "ground_speed": "speed", "acceleration": "acceleration",
-        "yaw_rate": "rotation",
-    }  # fmt: skip
-    return of_quantity.get(channel.quantity, "angle")
 
 
 def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> Iterator[Finding]:
@@ -309,10 +291,9 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         if quantity in ("torque_limit", LOCK, *POSITION_ROLES) or s.count < 50:
             continue
         _, value = heard[name]
-        unit = SI.get(_dimension(s.channel), "")
         if s.low == s.high:
             if drives > LIMITS.least_seconds or quantity == "ground_speed":
-                text = f"{s.channel.key}: reads {s.low:.4g} {unit} in all {s.count} values: is the sensor connected?"
+                text = f"{s.channel.key}: reads {s.low:.4g} {s.unit} in all {s.count} values: is the sensor connected?"
                 yield Finding(text, False, (name,) if s.low != 0.0 else ())
             continue
         noise = getattr(config.noise, "speed" if quantity == "motor_speed" else quantity)
@@ -323,7 +304,7 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
         if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
             yield Finding(
-                f"{s.channel.key}: jumps by {typical:.3g} {unit} from one value to the next, {typical / sd:.0f} times"
+                f"{s.channel.key}: jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times"
                 f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.path}"
                 " right in the DBC?",
                 True,
@@ -370,8 +351,6 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
 
 
 # --- signals compared with each other ---
-
-Check = Callable[[Facts], Iterator[Finding]]
 
 
 def _compared(

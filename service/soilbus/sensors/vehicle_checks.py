@@ -20,10 +20,18 @@ import numpy as np
 
 from soilbus.estimation.window import pairs, pull_given
 from soilbus.sensors.consistency import change, median
-from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, block_means, regression, spread, steps
+from soilbus.sensors.facts import (
+    LIMITS,
+    Facts,
+    Finding,
+    UndecidableError,
+    block_means,
+    changes,
+    regression,
+    spread,
+    steps,
+)  # fmt: skip
 from soilbus.terra.vehicle import GRAVITY, axle_loads
-
-__all__ = ["VEHICLE_CHECKS"]
 
 
 def _weight(facts: Facts) -> Iterator[Finding]:
@@ -43,7 +51,11 @@ def _weight(facts: Facts) -> Iterator[Finding]:
     if abs(off) > LIMITS.weight / 2.0:
         yield Finding(
             f"the wheel loads sum to {measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg, but"
-            f" vehicle.mass = {chassis.mass:g} kg: {_why_weight(measured / weight)}",
+            f" vehicle.mass = {chassis.mass:g} kg: "
+            + (
+                _known_factor(measured / weight, 0.04)
+                or "which of them is wrong? (ballast, unit or scale of the loads)"
+            ),
             abs(off) > LIMITS.weight,
             names if abs(off) > LIMITS.weight else (),
         )
@@ -98,13 +110,11 @@ def _transfer(facts: Facts) -> Iterator[Finding]:
         return
     known = (np.where(np.isfinite(a), a, 0.0) for a in (window.pitch, window.acceleration))
     front = np.broadcast_to(axle_loads(chassis, window.draft, *known)[0], window.t.shape)
-    lag, block = steps(facts)
     more = window.load @ (2.0 * rig.ahead - 1.0)
-    rows = np.stack([change(more, lag), 2.0 * change(np.where(facts.straight, front, np.nan), lag)], axis=1)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 40 * block:
+    rows = changes(facts, more, 2.0 * np.where(facts.straight, front, np.nan))
+    if rows is None:
         return
-    y, x = block_means(rows, block).T
+    y, x = rows.T
     lever = max(chassis.hitch_height, chassis.cg_height) / chassis.wheelbase
     if x.std() < LIMITS.excited * chassis.mass * GRAVITY * lever:
         return
@@ -121,11 +131,6 @@ def _transfer(facts: Facts) -> Iterator[Finding]:
 def _log_off(ratio: float) -> float:
     """How far a ratio is from one, as a logarithm; infinite where a channel reads nothing, or below it."""
     return abs(math.log(ratio)) if ratio > 0.0 else math.inf
-
-
-def _why_weight(ratio: float) -> str:
-    """The likely mistake if the loads are this multiple of the weight."""
-    return _known_factor(ratio, 0.04) or "which of them is wrong? (ballast, unit or scale of the loads)"
 
 
 FACTORS = {
@@ -337,16 +342,14 @@ def _balance(facts: Facts) -> Iterator[Finding]:
             torques,
         )
         return
-    bin_length = facts.config.estimator.bin
-    lag, block = steps(facts)
     inertia = pull_given(window, chassis) - window.draft
-    changes = np.stack([change(a, lag) for a in (thrust, window.draft, inertia)], axis=1)
-    changes = changes[np.isfinite(changes).all(axis=1)]
-    if len(changes) * bin_length < LIMITS.least_seconds:
+    least = LIMITS.least_seconds / facts.config.estimator.bin
+    rows = changes(facts, thrust, window.draft, inertia, least=least)
+    if rows is None:
         raise UndecidableError(
             "torques and draft are not known together: their signs and the gear ratio cannot be compared"
         )
-    given, *asked = block_means(changes, block).T
+    given, *asked = rows.T
     (of_draft, of_inertia), (draft_sd, inertia_sd) = regression(given, np.stack(asked, axis=1))
     swings = of_draft - LIMITS.side_sd * draft_sd > LIMITS.scale[1] and given.std() > LIMITS.excited * weight
     if asked[0].std() < LIMITS.excited * weight and not swings:
@@ -378,6 +381,7 @@ def _balance(facts: Facts) -> Iterator[Finding]:
         )
         return
     if of_inertia < -LIMITS.side_sd * inertia_sd:
+        lag, _ = steps(facts)
         slope = spread(change(window.pitch, lag)) * GRAVITY
         name = "pitch" if slope > spread(change(window.acceleration, lag)) else "acceleration"
         positive = "nose up" if name == "pitch" else "where the vehicle speeds up"

@@ -65,10 +65,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
 
 
 def _first_guess(load: Array, rest: Array) -> Array:
-    """log entry angle from the small-angle load K_L b r^(n+1) theta^(2n+1) / (n + 1.5); of a track from
-
-    K_L b L (r theta^2 / 2)^n.
-    """
+    """log entry angle for the load K_L b r^(n+1) theta^(2n+1) / (n + 1.5), or of tracks K_L b L (r theta^2 / 2)^n."""
     _, radius, width, K_L, n, *_ = rest
     scale = 0.6 * width * K_L * radius ** (n + 1.0)
     of_wheel = np.log(load * (n + 1.5) / scale) / (2.0 * n + 1.0)

@@ -46,15 +46,9 @@ from soilbus.arrays import Array
 from soilbus.terra.wheel_state import WheelModel, WheelState
 
 __all__ = [
-    "MEAN_SHEAR",
-    "mean_exponential_shear",
-    "mean_rational_shear",
-    "modulated_shear",
-    "track_forces",
-    "track_forces_and_jacobian",
-    "track_forces_and_slopes",
-    "track_load_and_slope",
-]
+    "MEAN_SHEAR", "mean_exponential_shear", "mean_rational_shear", "modulated_shear", "track_forces",
+    "track_forces_and_jacobian", "track_forces_and_slopes", "track_load_and_slope",
+]  # fmt: skip
 
 SERIES_BELOW = 0.02
 """u below which g and its derivative are power series: above, rounding costs them less than 1e-13 of their value."""
@@ -76,15 +70,7 @@ def _from_series(u: Array, near: Array, by_u: Array, coefficients: Sequence[floa
     return np.copysign(np.where(is_small, value, near), u), np.where(is_small, slope, by_u)
 
 
-def _inverse_factorials() -> tuple[float, ...]:
-    found, factorial = [], 1.0
-    for k in range(1, SERIES_TERMS + 1):
-        factorial *= k + 1
-        found.append((-1.0) ** (k + 1) / factorial)
-    return tuple(found)
-
-
-_OF_EXPONENTIAL = _inverse_factorials()
+_OF_EXPONENTIAL = tuple((-1.0) ** (k + 1) / math.factorial(k + 1) for k in range(1, SERIES_TERMS + 1))
 _OF_RATIONAL = tuple((-1.0) ** (k + 1) / (k + 1) for k in range(1, SERIES_TERMS + 1))
 
 
@@ -267,13 +253,17 @@ def _columns(state: WheelState, model: WheelModel, shape: Sequence[str]) -> Iter
             yield none, none, none
 
 
-def _forces(columns: Iterator[tuple[Any, Any, Any]], radius: Any, n_samples: int, n_columns: int) -> Array:
-    """W, DP and T (3, n_columns, N) of loads, thrusts and resistances."""
-    out = np.empty((3, n_columns, n_samples))
-    for i in range(n_columns):
-        load, thrust, resistance = next(columns)
-        out[0, i], out[1, i], out[2, i] = load, thrust - resistance, thrust * radius
+def _forces(state: WheelState, model: WheelModel, n_columns: int, shape: Sequence[str] = ()) -> Array:
+    """W, DP and T (3, n_columns, N): the forces, then their first derivatives as `_columns` yields them."""
+    out = np.empty((3, n_columns, len(state.entry_angle)))
+    for i, (load, thrust, resistance) in zip(range(n_columns), _columns(state, model, shape), strict=False):
+        out[0, i], out[1, i], out[2, i] = load, thrust - resistance, thrust * state.radius
     return out
+
+
+def _with_derivatives(found: Array) -> Array:
+    """Forces (3, 1 + D, N) as rows: the forces themselves, then all derivatives (3 + 3 D, N)."""
+    return np.concatenate([found[:, 0], found[:, 1:].reshape(-1, found.shape[2])])
 
 
 def track_forces(state: WheelState, model: WheelModel) -> Array:
@@ -286,23 +276,19 @@ def track_forces(state: WheelState, model: WheelModel) -> Array:
     model
         Shear law and hard pan; the shape of a rim's contact does not matter.
     """
-    return np.asarray(_forces(_columns(state, model, ()), state.radius, len(state.entry_angle), 1)[:, 0])
+    return np.asarray(_forces(state, model, 1)[:, 0])
 
 
 def track_forces_and_jacobian(state: WheelState, model: WheelModel, shape: Sequence[str] = ()) -> Array:
     """Return the forces and their derivatives by wheel.INPUTS and some of SHAPE or the length (3 + 21 + 3 D, N)."""
-    n_columns, n = 8 + len(shape), len(state.entry_angle)
-    found = _forces(_columns(state, model, shape), state.radius, n, n_columns)
-    return np.concatenate([found[:, 0], found[:, 1:].reshape(3 * n_columns - 3, n)])
+    return _with_derivatives(_forces(state, model, 8 + len(shape), shape))
 
 
 def track_forces_and_slopes(state: WheelState, model: WheelModel) -> Array:
     """Return the forces and their derivatives by angle and slip (3 + 6, N)."""
-    n = len(state.entry_angle)
-    found = _forces(_columns(state, model, ()), state.radius, n, 3)
-    return np.concatenate([found[:, 0], found[:, 1:].reshape(6, n)])
+    return _with_derivatives(_forces(state, model, 3))
 
 
 def track_load_and_slope(state: WheelState, model: WheelModel) -> Array:
     """Return the load and its derivative by the angle (2, N)."""
-    return np.asarray(_forces(_columns(state, model, ()), state.radius, len(state.entry_angle), 2)[0])
+    return np.asarray(_forces(state, model, 2)[0])

@@ -112,11 +112,6 @@ class Drive(NamedTuple):
     distance: Array
     felt: float
 
-    def driven_since(self, since: float) -> float:
-        """Return the distance [m] driven from a time [s] until the end."""
-        at_end, before = np.interp((self.end, since), self.t, self.distance).tolist()
-        return float(at_end - before)
-
 
 def trial(task: Task) -> WarningTrial:
     """Simulate one drive, estimate every hop as the service does, and rate its warnings."""
@@ -175,8 +170,8 @@ def rated(kind: str, seen: Drive, begins: Sequence[float], holds: bool) -> Warni
         return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
     lead = seen.end - begins[-1] if holds and begins else 0.0
     possible = seen.end - min(max(seen.felt, seen.start), seen.end)
-    distance, possible_distance = (seen.driven_since(seen.end - s) for s in (lead, possible))
-    return WarningTrial(kind, seconds, len(begins), lead, distance, possible, possible_distance)
+    at_end, at_lead, at_possible = np.interp(seen.end - np.array([0.0, lead, possible]), seen.t, seen.distance).tolist()
+    return WarningTrial(kind, seconds, len(begins), lead, at_end - at_lead, possible, at_end - at_possible)
 
 
 def warning_trials(

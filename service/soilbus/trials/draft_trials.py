@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.trials.draws import Each, drawn_soil, first_drive, prior_about, seeds_of, with_prior
 from soilbus.trials.windows import first_window, torque_limits
 
-__all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
+__all__ = ["SOILS", "DraftFigures", "DraftTrial", "draft_trials", "figures", "trial", "true_largest_draft"]
 
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
 SOIL_LOG_SD = 0.1
@@ -37,14 +38,6 @@ LOW_SLIP, HIGH_SLIP = (0.04, 0.10), (0.20, 0.40)
 """Ranges of the lowest and of the highest slip of a drive."""
 SLIP_SHARES = np.linspace(0.02, 1.0, 50)
 """Slips at which the true draft is solved, over the greatest slip allowed."""
-
-
-class Task(NamedTuple):
-    """Task to simulate one drive."""
-
-    config: Config
-    soil: str
-    seed: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +67,13 @@ def draft_trials(config: Config, drives: int, seed: int, each: Each = map) -> It
     """Yield the figures of drives on each of SOILS, then of all; SimulationError where none can drive."""
     everything: list[DraftTrial] = []
     for name in SOILS:
-        everything += (of_soil := list(each(trial, [Task(config, name, s) for s in seeds_of(seed, name, drives)])))
+        everything += (of_soil := list(each(partial(trial, config, name), seeds_of(seed, name, drives))))
         yield figures(name, of_soil)
     yield figures("all", everything)
 
 
-def trial(task: Task) -> DraftTrial:
-    """Simulate one drive, estimate, predict, and solve for the true draft."""
-    config, name, seed = task
+def trial(config: Config, name: str, seed: int) -> DraftTrial:
+    """Simulate one drive on a soil of this name, estimate, predict, and solve for the true draft."""
     rig, rng = rig_of(config), np.random.default_rng([seed, 2])
 
     def draw() -> tuple[Soil, Scenario]:

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,14 +26,9 @@ MAX_DRAWS = 100
 _PHI = PARAMETERS.index("phi")
 
 _T = TypeVar("_T")
-_R = TypeVar("_R")
 
-
-class Each(Protocol):
-    """Map of a work over tasks, here or in other processes."""
-
-    def __call__(self, work: Callable[[_T], _R], tasks: Iterable[_T], /) -> Iterable[_R]:
-        """The results in the order of the tasks."""
+Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Map of a work over tasks, here or in other processes: results in the order of the tasks."""
 
 
 @contextmanager

@@ -11,7 +11,6 @@ here to be compared with: one operating point hardly separates K_L from n.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -19,12 +18,11 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.terra.rim import Quadrature, fixed_shares
-from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel import EXACT_NODES
 
 __all__ = [
-    "EXACT", "EXACT_EXPONENTIAL", "SIMPSON", "Equations", "Forces", "OperatingPoint", "Solution", "Three",
-    "Unknowns", "WheelEquations", "entry_angle", "moduli_from_two_widths",
+    "EXACT", "SIMPSON", "Forces", "OperatingPoint", "Solution", "Three", "Unknowns", "WheelEquations", "entry_angle",
+    "moduli_from_two_widths",
 ]  # fmt: skip
 
 Three = tuple[float, float, float]
@@ -73,17 +71,8 @@ class Forces(NamedTuple):
     T: float
 
 
-@dataclass(frozen=True, slots=True)
-class Equations:
-    """Rule of integration, "simpson" (eqs. 23-33) or "gauss" (to 1e-10), and shear law."""
-
-    rule: str = "simpson"
-    shear_law: str = "rational"
-
-
-SIMPSON = Equations()
-EXACT = Equations(rule="gauss")
-EXACT_EXPONENTIAL = Equations(rule="gauss", shear_law="exponential")
+SIMPSON, EXACT = "simpson", "gauss"
+"""Rules of integration: eqs. 23-33, and Gauss' to 1e-10."""
 
 
 class Solution(NamedTuple):
@@ -109,10 +98,10 @@ class WheelEquations:
 
     __slots__ = ("_of_c", "_rows", "_unit", "_z")
 
-    def __init__(self, point: OperatingPoint, equations: Equations = SIMPSON) -> None:
+    def __init__(self, point: OperatingPoint, rule: str = SIMPSON) -> None:
         _, slip, r, width, c, K = point
         theta = entry_angle(point)
-        share, weight, of_normal = _nodes(equations.rule)
+        share, weight, of_normal = _nodes(rule)
         angle = theta * share
         directions = np.empty((3, *share.shape))  # of shear stress in W, DP and T
         sin, cos = np.sin(angle, directions[0]), np.cos(angle, directions[1])
@@ -120,8 +109,7 @@ class WheelEquations:
         carried = 1.0 - slip
         # eq. 16 as terra.stress has it, over r, with the sines at hand
         j = carried * sin - angle + (theta - carried * math.sin(theta))
-        law = equations.shear_law
-        mobilised = j / (j + K / r) if law == "rational" else SHEAR_LAWS[law](j * (r / K))[0]
+        mobilised = j / (j + K / r)
         fields = np.empty((5, *share.shape))  # normal stress in DP and W; shear in W, DP and T
         np.multiply(of_normal, directions[:2], out=fields[:2])
         np.multiply(weight * mobilised, directions, out=fields[2:])
@@ -130,7 +118,7 @@ class WheelEquations:
         stuck: list[float] = (rows[2:5] @ directions[2, 0]).tolist()
         self._of_c = c * stuck[0], c * stuck[1], c * stuck[2]
         z = r * (cos[0] - math.cos(theta))
-        if equations.rule == "simpson":  # its first node is the entry: no normal stress
+        if rule == SIMPSON:  # its first node is the entry: no normal stress
             rows[:5, 0], z[0] = 0.0, 1.0
         np.multiply(rows[:5], np.log(z), out=rows[5:])  # their derivatives by n, but for the power
         self._rows, self._z = rows, z
@@ -252,7 +240,7 @@ def _nodes(rule: str) -> tuple[Array, Array, Array]:
 
     Front branch from the entry, then rear branch from the exit, both to the middle (eq. 19).
     """
-    if rule == "gauss":
+    if rule == EXACT:
         share, weight = (a[..., 0] for a in fixed_shares(Quadrature(EXACT_NODES, 3, peak=0.5, exit=0.0)))
     else:
         share = np.array([[1.0, 0.75, 0.5], [0.0, 0.25, 0.5]])

@@ -11,7 +11,9 @@ from typing import NamedTuple
 from soilbus.report.table import table
 from soilbus.trials.paper import (
     EXACT,
+    MAX_ITERATIONS,
     Solution,
+    Three,
     Unknowns,
     WheelEquations,
     moduli_from_two_widths,
@@ -45,12 +47,13 @@ def paper_report(sinkage: float) -> str:
     """Return the whole output for a sinkage [m] of the simulated wheels."""
     parts = [
         _title("Xi et al. 2024 (World Electr. Veh. J. 15:217), reproduced"),
-        _text(
+        _item(
             f"The paper prints neither sinkage nor W, DP and T. Here they come from its own equations, corrected as "
             f"`soilbus docs equations` lists them, for the true soil at a sinkage of {sinkage:g} m and slip 0.2: data "
             f"and solver share the three angles of Simpson's rule, as in the paper. 'ours' is its iteration (eq. 41) "
             f"to relative steps of 1e-8; 'recomputed' its printed result against its Tables 2 and 5. K_L and k_phi in "
-            f"kN/m^(n+2), k_c in kN/m^(n+1)."
+            f"kN/m^(n+2), k_c in kN/m^(n+1).",
+            "",
         ),
         _title("What holds") + "".join(_item(text) for text in what_holds(sinkage)),
         *(repr(paper_table(number, sinkage)) for number in START_ERRORS),
@@ -63,12 +66,8 @@ def _title(text: str) -> str:
     return f"{text}\n{'=' * len(text)}\n"
 
 
-def _text(text: str) -> str:
-    return textwrap.fill(text, WIDTH) + "\n"
-
-
-def _item(text: str) -> str:
-    return textwrap.fill(text, WIDTH, initial_indent="- ", subsequent_indent="  ") + "\n"
+def _item(text: str, mark: str = "- ") -> str:
+    return textwrap.fill(text, WIDTH, initial_indent=mark, subsequent_indent=" " * len(mark)) + "\n"
 
 
 def what_holds(sinkage: float) -> list[str]:
@@ -79,7 +78,7 @@ def what_holds(sinkage: float) -> list[str]:
     above = [_from_above(trial, sinkage) for trial in TRIALS.values()]
     own = [run for run in RUNS if (run.table, run.on) != (7, "tractor 2")]
     before = max(max(errors_in_percent(from_print(run.result), run.trial.truth)) for run in own)
-    after = max(max(errors_in_percent(_one_step(run, sinkage), run.trial.truth)) for run in own)
+    after = max(max(errors_in_percent(_newton(run, sinkage, run.result, 1).end, run.trial.truth)) for run in own)
     wheel, truth = WheelEquations(WET_CLAY.at(sinkage)), WET_CLAY.truth
     found = wheel.all_solutions(WheelEquations(WET_CLAY.at(sinkage), EXACT).forces(truth))
     K_L = " or ".join(f"K_L = {x.K_L / 1e3:.0f}" for x in found) or "no solution"
@@ -120,16 +119,10 @@ def _from_above(trial: Trial, sinkage: float) -> tuple[bool, bool]:
     return newton, eliminated
 
 
-def _newton(run: Run, sinkage: float) -> Solution:
-    """The paper's iteration from the printed start."""
+def _newton(run: Run, sinkage: float, start: Three | None = None, most: int = MAX_ITERATIONS) -> Solution:
+    """The paper's iteration from printed values, by default its printed start."""
     wheel = WheelEquations(run.trial.at(sinkage))
-    return wheel.newton(wheel.forces(run.trial.truth), from_print(run.start))
-
-
-def _one_step(run: Run, sinkage: float) -> Unknowns:
-    """Where one more step of the iteration takes the printed result."""
-    wheel = WheelEquations(run.trial.at(sinkage))
-    return wheel.newton(wheel.forces(run.trial.truth), from_print(run.result), most=1).end
+    return wheel.newton(wheel.forces(run.trial.truth), from_print(start or run.start), most)
 
 
 def _seconds(run: Run, sinkage: float) -> float:

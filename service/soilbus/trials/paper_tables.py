@@ -15,7 +15,7 @@ from soilbus.trials.paper import OperatingPoint, Unknowns
 
 __all__ = [
     "RUNS", "SANDY_LOAM", "SINKAGE", "SLIP", "START_ERRORS", "TRACTOR_2", "TRIALS", "WET_CLAY", "Run", "Trial",
-    "as_print", "errors_in_percent", "from_print",
+    "as_print", "errors_in_percent", "from_print"
 ]  # fmt: skip
 
 SLIP = 0.2

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,6 @@ from scipy.stats import binomtest
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
-from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
@@ -47,13 +47,6 @@ MIN_PROBABILITY = 1e-3
 """Least and, from 1, greatest probability that a margin near the limit is drawn for."""
 BINS = 10
 """Equal intervals of probability."""
-
-
-class Task(NamedTuple):
-    """Task to simulate one drive."""
-
-    config: Config
-    seed: int
 
 
 class Ground(NamedTuple):
@@ -112,12 +105,11 @@ class Reliability:
 
 def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> Reliability:
     """Return the figures of `drives` simulated verdicts; SimulationError where the vehicle cannot drive."""
-    return reliability(list(each(trial, [Task(config, s) for s in seeds_of(seed, "verdicts", drives)])))
+    return reliability(list(each(partial(trial, config), seeds_of(seed, "verdicts", drives))))
 
 
-def trial(task: Task) -> Call:
+def trial(config: Config, seed: int) -> Call:
     """Simulate one drive, estimate, call, and solve for the truth."""
-    config, seed = task
     rng = np.random.default_rng([seed, 4])
 
     def draw() -> tuple[Ground, Scenario]:
@@ -141,20 +133,12 @@ def trial(task: Task) -> Call:
         estimating = _with_settings(estimating, margin=margin)
         decision = decided(estimating)
     probability = math.nan if decision.probability is None else decision.probability
-    can = _can(config, ground, estimating.traversability, _asked(recording, config))
-    return Call(ground.name, probability, decision.state, decision.limit, can)
+    return Call(ground.name, probability, decision.state, decision.limit, _can(estimating, ground, recording))
 
 
 def _with_settings(config: Config, **settings: float) -> Config:
     """The configuration with other settings of the decision."""
     return config.model_copy(update={"traversability": config.traversability.model_copy(update=settings)})
-
-
-def _asked(recording: Recording, config: Config) -> float:
-    """True draft [N] that is asked for on the level: the mean over the last hop or the window, whichever is larger."""
-    t, draft = recording.truth["t"], recording.truth["draft"]
-    end = min(config.estimator.window, float(t[-1]))
-    return float(max(draft[(t > end - length) & (t <= end)].mean() for length in (end, config.estimator.hop)))
 
 
 def _margin(decision: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
@@ -165,8 +149,14 @@ def _margin(decision: Traversability, demand: Demand, rng: np.random.Generator) 
     return (most.value - sure * math.hypot(most.std, demand.std)) / demand.pull - 1.0
 
 
-def _can(config: Config, ground: Ground, settings: Settings, asked: float) -> bool:
-    """Whether the soil truly holds the pull asked for [N] and its margin within all limits."""
+def _can(config: Config, ground: Ground, recording: Recording) -> bool:
+    """Whether the soil truly holds the draft on the level and its margin within all limits.
+
+    The draft is the true mean over the last hop or the window, whichever is larger.
+    """
+    settings, t, draft = config.traversability, recording.truth["t"], recording.truth["draft"]
+    end = min(config.estimator.window, float(t[-1]))
+    asked = float(max(draft[(t > end - length) & (t <= end)].mean() for length in (end, config.estimator.hop)))
     most = true_largest_draft(
         ground.soil, rig_of(config), ground.torque_limit, settings.max_slip,
         WheelModel(shear_law=config.model.shear_law), ground.max_sinkage, drivetrain_of(config),
