@@ -90,7 +90,7 @@ def test_one_field_does_not_separate_a_slope_from_an_offset():
     assert min(chances(found)[name] for name in ("draft_offset", "grade")) > 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="half a degree of pitch is seen in bins, not in means over a tenth of a second")
+@pytest.mark.xfail(strict=True, reason="half a degree of pitch is not seen in means over a quarter of a second")
 def test_a_pitch_offset_is_one_of_the_vehicle():
     """A pitch sensor that is off by 0.5 deg leaves the same push in every recording, and is never given more than 1."""
     found = diagnosed(CONFIG, 7, (0.0,) * 4)

@@ -215,7 +215,7 @@ def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:
     >>> found.verdict, list(found.effects)
     ('named', ['slip_sinkage'])
     >>> found
-    an effect is missing, and the data tell which: slip_sinkage (gap 1.42 -> 0.98)
+    an effect is missing, and the data tell which: slip_sinkage (gap 2.06 -> 0.95)
     """
     path = None if isinstance(config, Config) else found_configuration(str(config))
     with _paths(logs) as paths:
