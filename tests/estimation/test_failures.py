@@ -98,7 +98,8 @@ def test_failures_have_their_kind(drive, undisturbed):
 
     window = drive[0].window
     opposed = failure(torque=-window.torque)
-    assert (opposed.failure, opposed.status, opposed.reason) == (None, Status.DEGRADED, "model_mismatch")
+    assert (opposed.failure, opposed.status, opposed.reason) == (None, Status.INVALID, "model_mismatch")
+    assert opposed.posterior is None  # where a descent ended without an optimum there is nothing to say
     immense = failure(torque=np.full_like(window.torque, 1e300))
     assert (immense.failure, immense.status, immense.reason) == ("not_finite", Status.INVALID, "no_convergence")
     assert immense.posterior is None

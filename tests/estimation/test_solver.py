@@ -47,7 +47,7 @@ class OneResidual:
         if not math.isfinite(r):
             return None
         none = np.zeros((1, 1))
-        return QuadraticModel(np.array([[slope**2]]), none, np.zeros(1), np.array([slope * r]), r**2, np.zeros((0, 1)))
+        return QuadraticModel(np.array([[slope**2]]), none, np.array([slope * r]), r**2, np.zeros((0, 1)))
 
     def stepped(self, iterate, model, step):
         return replace(iterate, soil=iterate.soil + step)
@@ -119,8 +119,7 @@ def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_o
     rng = np.random.default_rng(seed)
     root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)
     none = np.zeros((4, 4))
-    outward = np.diag(sides)[np.array(sides) != 0.0]
-    model = QuadraticModel(root.T @ root, none, np.zeros(4), root.T @ target, 0.0, outward)
+    model = QuadraticModel(root.T @ root, none, root.T @ target, 0.0, np.diag(sides)[np.array(sides) != 0.0])
     step = model.step()
     assert np.all(step * np.array(sides) <= 1e-12)
     value = float(np.sum((root @ step + target) ** 2))

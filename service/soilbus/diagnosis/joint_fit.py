@@ -125,17 +125,16 @@ class JointObjective:
     def together(self, models: Sequence[WindowModel]) -> JointModel:
         """The quadratic model of all recordings from that of each."""
         information, of_prior = np.zeros((2, self.size, self.size))
-        curvature, gradient = np.zeros((2, self.size))
+        gradient = np.zeros(self.size)
         bounds = [np.zeros((len(model.active_bounds), self.size)) for model in models]
         for model, columns, outward in zip(models, self.columns, bounds, strict=True):
             block = columns[:, None], columns
             information[block] += model.information
             of_prior[block] += model.prior_information
-            curvature[columns] += model.curvature
             gradient[columns] += model.gradient
             outward[:, columns] = model.active_bounds
         value = sum(model.neg2_log_posterior for model in models)
-        return JointModel(information, of_prior, curvature, gradient, value, np.vstack(bounds), tuple(models))
+        return JointModel(information, of_prior, gradient, value, np.vstack(bounds), tuple(models))
 
     def stepped(self, iterate: tuple[Iterate, ...], model: JointModel, step: Array) -> tuple[Iterate, ...]:
         """The iterate of each recording after a step of all coordinates, shortened at the first bound of any."""

@@ -87,16 +87,6 @@ class Coordinates:
         self._last_directions[:] = soil, directions
         return directions
 
-    def curvature(self, gradient: Array) -> Array:
-        """Return what the coordinates themselves add to the Hessian's diagonal (F,), by half the data's gradient (F,).
-
-        The model is nearly linear in k_c, and so curved in log k_c.  The positive part alone shortens steps.
-        """
-        curvature = np.zeros(len(gradient))
-        if _K_C in self._column:
-            curvature[self._column[_K_C]] = max(gradient[self._column[_K_C]], 0.0)
-        return curvature
-
     def stepped(self, soil: Array, step: Array) -> Array:
         """Return the soil (6,) after a step (F,), which is shortened to `max_log_step`."""
         step = step * min(1.0, self.options.max_log_step / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))

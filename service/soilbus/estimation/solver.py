@@ -6,7 +6,7 @@ covariance, p the residuals of the prior and P its precision,
     objective     F(theta) = -2 log posterior = r' W r + p' P p + constant
     Jacobian      J = dr/dtheta,   J_p = dp/dtheta
     model         gradient g = J' W r + J_p' P p,   information H = J' W J + J_p' P J_p
-    step          (H + C) d = -g,   subject to the active bounds, C the curvature of the coordinates
+    step          H d = -g,   subject to the active bounds
     decrease      of F, predicted for a full step: D = d' H d, its squared length in posterior sd
 
 `Objective` evaluates residuals, Jacobian and prior at an `Iterate` and returns the `QuadraticModel` there.  `minimise`
@@ -62,7 +62,6 @@ class QuadraticModel:
 
     information: Array  # (F + A, F + A), Gauss-Newton Hessian, half that of -2 log posterior: data and prior
     prior_information: Array  # (F + A, F + A), the prior's part of it
-    curvature: Array  # (F + A,), diagonal that the coordinates' own curvature adds for a step
     gradient: Array  # (F + A,), half the gradient of -2 log posterior
     neg2_log_posterior: float  # value of the objective, up to a constant
     active_bounds: Array  # (E, F + A), outward directions of the bounds that the iterate is at: no step goes there
@@ -73,7 +72,7 @@ class QuadraticModel:
         A step that would cross an active bound goes along it, to the least value there.
         """
         right = np.concatenate([self.gradient[None], self.active_bounds]).T
-        solution = _solution(self.information + np.diag(self.curvature), right)
+        solution = _solution(self.information, right)
         if solution is None:
             return None
         step = -solution[:, 0]
@@ -230,12 +229,9 @@ class Objective:
         neg2_log_posterior = linearisation.chi2 + prior.neg2_log_prior
         if not math.isfinite(neg2_log_posterior):
             return None
-        curvature = np.zeros_like(gradient)
-        curvature[: len(self.free)] = self.coordinates.curvature(gradient[: len(self.free)])
         return WindowModel(
             information=directions.T @ linearisation.normal @ directions + prior.information,
             prior_information=prior.information,
-            curvature=curvature,
             gradient=gradient + prior.gradient,
             neg2_log_posterior=neg2_log_posterior,
             active_bounds=self._active_bounds(iterate),

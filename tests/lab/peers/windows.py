@@ -79,7 +79,7 @@ def assumed_of(soil: Soil, rng: np.random.Generator) -> Soil:
     return Soil(*(np.asarray(soil) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
 
 
-AS_PEERS = replace(ESTIMATOR, standing=HELD, search=replace(ESTIMATOR.search, cold=SolverOptions()))
+AS_PEERS = replace(ESTIMATOR, standing=HELD, search=replace(ESTIMATOR.search, cold=SolverOptions(100)))
 """The peers know no relaxation, inertia and lateness, and go on to the end of a descent."""
 
 
