@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.sensors.bins import Bins
@@ -22,7 +23,15 @@ def wandering(rate: float, seed: int):
     columns = {name: (c.t, c.value) for name, c in channels.items() if name in rig_of(config).channels}
     t, draft = columns["draft"]
     store.add(columns | {"draft": (t, draft + 300.0 + rate * (t - DURATION))})
-    return record_of(f"{seed}", store.window(0.0, DURATION), rig_of(config), model_of(config), 0.2, 0.15)
+    return record_of(
+        f"{seed}",
+        store.window(0.0, DURATION),
+        rig_of(config),
+        model_of(config),
+        0.2,
+        0.15,
+        DiagnosisOptions(instant=0.1),
+    )
 
 
 def test_each_recording_has_a_wander_of_its_own():

@@ -9,6 +9,7 @@ import pytest
 
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import Verdict
@@ -39,7 +40,7 @@ def recorded(soil="loam", hidden=()):
     store = Bins(rig, 0.1, 0.0)
     channels = simulate(CONFIG, excited(soil, 60.0), 5, hidden).channels
     store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-    return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15)
+    return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15, DiagnosisOptions(instant=0.1))
 
 
 def test_a_fit_from_the_optimum_with_the_latents_as_measured_ends_with_them_at_their_optimum():

@@ -9,6 +9,7 @@ import pytest
 
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.model_out import effect_tables
+from soilbus.diagnosis.options import DiagnosisOptions
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
@@ -35,7 +36,9 @@ def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None
         columns[channel] = t, value + error(t, truth["slip.RL"], truth["ground_speed"])
     store = Bins(rig, 0.1, 0.0)
     store.add(columns)
-    return record_of("drive", store.window(0.0, seconds), rig, model_of(config), 0.2, 0.15)
+    return record_of(
+        "drive", store.window(0.0, seconds), rig, model_of(config), 0.2, 0.15, DiagnosisOptions(instant=0.1)
+    )
 
 
 def places(record: Record) -> list[Disagreement]:

@@ -48,7 +48,9 @@ def cost_of_instant(window: Window, rig: Rig, i: int, soil: Soil, gains: dict[st
         return np.gradient(values, window.t, axis=0)[i]
 
     kinematic = 1.0 - window.ground_speed[:, None] / (rig.radius * window.speed)
-    relaxed = kinematic[i] - gains.get("relaxation_length", 0.0) / window.ground_speed[i] * slope_of(kinematic)
+    rim, accelerates = rig.radius * window.speed[i], slope_of(window.ground_speed)
+    slip_rate = (window.ground_speed[i] * slope_of(window.speed) / window.speed[i] - accelerates) / rim
+    relaxed = kinematic[i] - gains.get("relaxation_length", 0.0) / window.ground_speed[i] * slip_rate
     by_slip = rig.radius * window.speed[i] ** 2 / window.ground_speed[i]
     seen = np.concatenate([corrected("load"), corrected("speed") + by_slip * (relaxed - kinematic[i])])
     ground = corrected("ground_speed")

@@ -143,10 +143,11 @@ def record_of(
     TooLittle
         Where the recording has not enough usable instants.
     """
-    end = float(window.t[-1]) if len(window.t) else 0.0
+    end, span = (float(window.t[-1]), float(np.ptp(window.t))) if len(window.t) else (0.0, 0.0)
+    length = min(options.instant, span / (2 * options.folds * options.min_sample))
     bins, problem = (
         ObservationModelWithEffects(part, diagnosed(rig), model, min_speed, max_turn).with_own_stamps().on_curves()
-        for part in (window, averaged(window, end, instant_of(rig, options.instant)))
+        for part in (window, averaged(window, end, instant_of(rig, length)))
     )
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1

@@ -207,8 +207,10 @@ class Search:
     def _is_within_a_cycle(self, model: FittedModel) -> bool:
         """Whether the last effect delays no channel by more than its sample time, for sure: stamps do that."""
         effect = model.effects[-1]
+        if not effect.late:
+            return False
         found, problem = model.parameters()[effect.name], self.full.records[-1].training
-        return bool(effect.late) and not any(
+        return not any(
             found[late.delay].value - self.options.delay_sure_sd * found[late.delay].std > problem.sample_time(quantity)
             for quantity, late in effect.late.items()
         )
