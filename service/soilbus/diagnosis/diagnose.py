@@ -180,19 +180,8 @@ def diagnose(
     if verdict is Verdict.AMBIGUOUS:
         progress("fitting the rivals")
         rivals = rivals_of(full, present, additions, candidates)
-    return Diagnosis(
-        verdict,
-        tuple(where),
-        tuple(additions),
-        base,
-        present,
-        tuple(remaining),
-        before,
-        after,
-        imitation,
-        shown,
-        rivals,
-    )
+    found = tuple(where), tuple(additions), base, present, tuple(remaining), before, after
+    return Diagnosis(verdict, *found, imitation, shown, rivals)
 
 
 def rivals_of(
