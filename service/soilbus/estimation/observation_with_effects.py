@@ -80,7 +80,8 @@ class ObservationModelWithEffects(ObservationModel):
     def _sensor_std(self) -> Array:
         """Return the prior sd of the sensors' gains; a channel that an effect delays has no lateness beside it.
 
-        Two shifts of opposite sign would leave a second difference, which takes up noise.
+        Two shifts of opposite sign would leave a second difference, which takes up noise.  Torques keep theirs, by
+        which they differ from each other.
         """
         fitted = {(f.effect, f.parameter.name) for f in self.free if f.std > 0.0}
         late = [q for e in self.effects for q, names in e.late.items() if (e.name, names.delay) in fitted]

@@ -70,7 +70,9 @@ def standing_columns(window: Window, rig: Rig, slopes: Mapping[str, Array] | Non
     with np.errstate(invalid="ignore", divide="ignore"):
         if slopes is None:
             slopes = {quantity: np.gradient(getattr(window, quantity), window.t, axis=0) for quantity in SLOPES}
-        speed, load, ground, draft, acceleration = (np.nan_to_num(slopes[quantity]) for quantity in SLOPES)
+        speed, load, ground, draft, acceleration = (
+            np.where(np.isfinite(slopes[quantity]), slopes[quantity], 0.0) for quantity in SLOPES
+        )
         forward = window.ground_speed[:, None]
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
