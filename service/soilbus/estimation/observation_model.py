@@ -130,7 +130,7 @@ class ObservationModel(Measurements):
             by_gain[:, :, layout.standing] = self.standing_rows + A @ self.standing_latents
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
-            residual += self.delay_residuals(delay, A, gains)
+            residual += self._delay_residuals(delay, A, gains)
             by_delay = delay.by_measured * of_latents
             by_effects[:, torques] += (of_torque * delay.by_torque).transpose(1, 2, 0)
             by_effects[:, balance] += delay.by_demand.T
@@ -347,15 +347,14 @@ class ObservationModel(Measurements):
         """Corrections for delays at gains (G,); None without."""
         return None
 
-    def delay_residuals(self, delay: DelayTerms | None, A: Array, gains: Array) -> Array:
+    def _delay_residuals(self, delay: DelayTerms, A: Array, gains: Array) -> Array:
         """Part (N, m) of the residuals due to delays; A (N, m, 2 W + 1): their derivatives by the latents."""
         residual, layout = np.zeros(A.shape[:2]), self.layout
-        if delay is not None:
-            gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
-            residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains]
-            residual[:, layout.balance] = delay.demand
-            residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
-            residual[~self._known] = 0.0
+        gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
+        residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains]
+        residual[:, layout.balance] = delay.demand
+        residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
+        residual[~self._known] = 0.0
         return residual
 
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:

@@ -5,8 +5,8 @@
     torque     T = T_soil + J domega/dt                          inertia J of a wheel
     channel    y(t) = x(t - d),   x = y + d dy/dt                d: lateness beside torque and wheel speed
 
-Each is linear in its parameter to first order, about none of it: one more gain, with a prior of mean 0 and
-a column of the Jacobian.  Its posterior goes on from window to window.  L / V and d are short beside a second.
+Each parameter is one more gain with a prior of mean 0.  What it changes is linearised at 0, as L / V and d are short
+beside a second.  Its posterior is the prior of the next window.
 
 References
 ----------
@@ -32,7 +32,7 @@ STANDING = (
 )  # fmt: skip
 """Names of the parameters, in order: [m], [1: in `wheel_inertia` units], [s]."""
 SLOPES = ("speed", "load", "ground_speed", "draft", "acceleration")
-"""Quantities whose slopes they act by."""
+"""Quantities whose slopes by time these parts need."""
 
 
 class StandingColumns(NamedTuple):

@@ -1,7 +1,7 @@
-"""Logs of a fleet -> which vehicles have which fault: read, diagnosed vehicle by vehicle, then judged together.
+"""Find which vehicles of a fleet have which fault, by their logs.
 
-logs of a vehicle -> records -> diagnosis/fleet.py -> findings of a vehicle
-findings of all -> diagnosis.json, effects.parquet
+logs of a vehicle -> records -> diagnosis/fleet.py -> findings of this vehicle
+findings of all vehicles -> diagnosis.json, effects.parquet
 """
 
 from __future__ import annotations
