@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import lognorm
 
 from driven_windows import tracker_of, windows
-from soilbus.estimation.gaussian import solve_with_inverse
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.posterior import PARAMETERS, Posterior
 from soilbus.simulator.recording import simulate
@@ -85,3 +85,38 @@ def test_what_follows_cohesion_is_as_open_as_a_log_normal_one(std):
     assert posterior.tan_phi().std == pytest.approx(expected / pressure, rel=0.01)
     assert posterior.parameters()["c"].std == pytest.approx(expected, rel=0.01)
     assert posterior.shear_strength(pressure).std < 1e-6 * expected
+
+
+def joint(seed: int) -> tuple[Gaussian, np.ndarray]:
+    """A joint Gaussian of the soil and four gains, the second held, and the prior sd of the gains."""
+    rng = np.random.default_rng(seed)
+    std = np.array([0.02, 0.0, 0.5, 3.0])
+    free = np.concatenate([np.full(6, 0.3), std])
+    root = free[:, None] * rng.standard_normal((10, 14)) / 5.0
+    return Gaussian(rng.uniform(1.0, 2.0, 6), std * rng.standard_normal(4), root @ root.T), std
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.7, 0.2, 0.0])
+def test_a_forgotten_gain_has_the_geometric_mean_of_posterior_and_prior(kept):
+    """By the information filter: precisions and precisions times means are averaged; p(soil | gains) stays."""
+    before, std = joint(3)
+    after, at = before.forgotten(kept, std), [0, 2, 3]
+    old, new = (np.linalg.inv(g.covariance[6:, 6:][np.ix_(at, at)]) for g in (before, after))
+    assert new == pytest.approx(kept * old + np.diag((1.0 - kept) / std[at] ** 2), rel=1e-9)
+    assert new @ after.gains[at] == pytest.approx(kept * old @ before.gains[at], rel=1e-8, abs=1e-9)
+    for value in (np.zeros(3), std[at]):
+        known = [g.given(np.array(at), value) for g in (before, after)]
+        assert known[1].soil == pytest.approx(known[0].soil, rel=1e-9)
+        assert known[1].covariance == pytest.approx(known[0].covariance, abs=1e-12)
+
+
+def test_a_given_gain_conditions_the_soil():
+    """By the other formula: the precision matrix without the rows of what is given."""
+    before, _ = joint(5)
+    at, value = np.array([0, 2]), np.array([0.01, -0.2])
+    after, rest = before.given(at, value), [*range(6), 9]
+    precision = np.linalg.inv(before.covariance[np.ix_([*rest, 6, 8], [*rest, 6, 8])])
+    assert after.covariance[np.ix_(rest, rest)] == pytest.approx(np.linalg.inv(precision[:7, :7]), rel=1e-6)
+    moved = -np.linalg.solve(precision[:7, :7], precision[:7, 7:] @ (value - before.gains[at]))
+    assert np.log(after.soil / before.soil) == pytest.approx(moved[:6], rel=1e-6)
+    assert after.gains[at] == pytest.approx(value)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.model_form import FormPosterior, with_form_step
+from soilbus.estimation.model_form import FORM, FormPosterior, with_form_step
 from soilbus.estimation.nuisance_parameters import Free, active_at
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.effects.effect import Effect
@@ -29,11 +29,6 @@ from soilbus.terra.wheel import WheelModel, WheelState
 _Rows = slice | NDArray[np.intp]
 
 _SOIL = len(PARAMETERS)
-FORM_DIRECTIONS = 2
-"""Number of directions of the model's form that have a perturbed model in decisions.  At loads and slips that were
-driven the pull is measured, and errors of soil and form cancel.  Evidence: with two directions the std of the largest
-draft is within 7 % of that with all four (loam, wet clay, dry sand).  The form's covariance of the soil alone, with the
-form held, would give 5 to 15 times that std."""
 _HELD_VARIANCE = 1e-8
 """Variance, in units of a parameter's prior, below which its direction counts as known exactly."""
 
@@ -84,17 +79,18 @@ class UncertainModel:
             Posterior of the model's form; None where it is not uncertain.
         """
 
-        def at(standardised: Array, model: WheelModel = model) -> CompletedModel:
-            return CompletedModel.of(model, active_at(effects, free, standardised, n_wheels), ground_speed)
+        centre = np.zeros(len(FORM)) if form is None else form.centre
+
+        def at(standardised: Array, step: Array = centre) -> CompletedModel:
+            stepped = with_form_step(model, step) if step.any() else model
+            return CompletedModel.of(stepped, active_at(effects, free, standardised, n_wheels), ground_speed)
 
         first = len(gaussian.gains) - len(free)
         standardised = gaussian.gains[first:]
         mean = at(standardised)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
-        of_form = (
-            [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, with_form_step(model, step)))
-        )
+        of_form = [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, centre + step))
         if not len(places):
             return cls(mean, tuple(of_form), len(of_form))
         of_effects = _SOIL + first + places
@@ -128,12 +124,10 @@ class UncertainModel:
 
 
 def _perturbed_by_form(form: FormPosterior, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
-    """A perturbed model for each leading direction of the form's second moment, on the side on which its mean lies."""
-    variance, axes = np.linalg.eigh(form.moment)
+    """A perturbed model for each direction of the form's spread, on the side on which its mean lies."""
+    variance, axes = np.linalg.eigh(form.spread)
     axes = axes * np.where(form.mean @ axes < 0.0, -1.0, 1.0)
-    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T[-FORM_DIRECTIONS:][
-        variance[-FORM_DIRECTIONS:] > _HELD_VARIANCE
-    ]
+    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T[variance > _HELD_VARIANCE]
     return [PerturbedModel(at(step), form.by_form[:_SOIL] @ step) for step in steps]
 
 

@@ -1,7 +1,9 @@
 """Joint Gaussian of soil and gains, and the solution of normal equations.
 
-A window determines combinations of soil and gains, so its posterior is kept jointly.  Gains do not change from
-window to window; without their covariance with the soil the same ignorance would count as new information each time.
+A window determines combinations of soil and gains, so its posterior is kept jointly: without their covariance the same
+ignorance would count as new information each time.  Another marginal of some gains moves the rest by its regression,
+
+    B = C_xg C_gg^-1,    x += B (g' - g),    C += B (C_gg' - C_gg) B'
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior, SoilPrior
@@ -47,12 +50,38 @@ class Gaussian:
         """Return the marginal of one gain."""
         return Estimate(float(self.gains[index]), float(np.sqrt(self.covariance[_SOIL + index, _SOIL + index])))
 
-    def drifted(self, soil: Array, gains: Array) -> Gaussian:
-        """Return the Gaussian after a random walk of the soil (covariance (6, 6)) and the gains (variance (G,))."""
+    def drifted(self, soil: Array) -> Gaussian:
+        """Return the Gaussian after a random walk of the soil (covariance (6, 6))."""
         covariance = self.covariance.copy()
         covariance[:_SOIL, :_SOIL] += soil
-        covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] += gains
         return replace(self, covariance=covariance)
+
+    def forgotten(self, kept: float, std: Array) -> Gaussian:
+        """Return the Gaussian whose gains have the density p^kept p_0^(1 - kept), p_0 of mean 0 and this sd (G,).
+
+        Stabilised forgetting (Kulhavy & Zarrop 1993, Int. J. Control 58:905): what 1 / (1 - kept) windows say weighs
+        against the prior, so that an error which all windows share does not outweigh it in time.
+        """
+        at = np.flatnonzero(std > 0.0)
+        precision = np.linalg.inv(self.covariance[np.ix_(_SOIL + at, _SOIL + at)])
+        covariance = np.linalg.inv(kept * precision + np.diag((1.0 - kept) / std[at] ** 2))
+        return self._with_gains(at, kept * covariance @ (precision @ self.gains[at]), covariance)
+
+    def given(self, at: NDArray[np.intp], gains: Array) -> Gaussian:
+        """Return the Gaussian where the gains at these places (K,) have these values (K,)."""
+        return self._with_gains(at, gains, np.zeros((len(at), len(at))))
+
+    def _with_gains(self, at: NDArray[np.intp], gains: Array, covariance: Array) -> Gaussian:
+        """The Gaussian with another mean (K,) and covariance (K, K) of the gains at these places."""
+        old = self.covariance[np.ix_(_SOIL + at, _SOIL + at)]
+        by_gains = np.linalg.solve(old, self.covariance[_SOIL + at]).T
+        moved = by_gains @ (gains - self.gains[at])
+        return replace(
+            self,
+            soil=self.soil * np.exp(moved[:_SOIL]),
+            gains=self.gains + moved[_SOIL:],
+            covariance=self.covariance + by_gains @ (covariance - old) @ by_gains.T,
+        )
 
     def with_prior_soil(self, prior: SoilPrior) -> Gaussian:
         """Return the marginal of the gains with the prior of the soil, as on another soil."""

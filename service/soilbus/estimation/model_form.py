@@ -74,21 +74,25 @@ class FormPosterior:
         return cls(np.zeros((_SOIL + n_gains, len(FORM))), *form_prior(farthest))
 
     @property
-    def moment(self) -> Array:
-        """Second moment (4, 4) about the configured form."""
-        return self.covariance + np.outer(self.mean, self.mean)
+    def centre(self) -> Array:
+        """Mean (4,) of the form parameters, the configured form included."""
+        return np.asarray(OPEN * self.mean)
+
+    @property
+    def spread(self) -> Array:
+        """Covariance (4, 4) of the form parameters, the configured form included."""
+        return OPEN * self.covariance + OPEN * (1.0 - OPEN) * np.outer(self.mean, self.mean)
 
     @property
     def log_covariance(self) -> Array:
         """Covariance (6, 6) that the open form adds to the soil's logarithms."""
         of_soil = self.by_form[:_SOIL]
-        spread = OPEN * self.covariance + OPEN * (1.0 - OPEN) * np.outer(self.mean, self.mean)
-        return np.asarray(of_soil @ spread @ of_soil.T)
+        return np.asarray(of_soil @ self.spread @ of_soil.T)
 
     @property
     def log_shift(self) -> Array:
         """Shift (6,) of the soil's logarithms from the configured form to the mean over all forms."""
-        return np.asarray(OPEN * self.by_form[:_SOIL] @ self.mean)
+        return np.asarray(self.by_form[:_SOIL] @ self.centre)
 
 
 def with_form_step(model: WheelModel, step: Array) -> WheelModel:

@@ -168,11 +168,13 @@ class Posterior:
         variance, axes = np.linalg.eigh((self.log_covariance + more)[at] / unit)
         covariance = np.zeros_like(self.log_covariance)
         covariance[at] = (axes * np.clip(variance, 0.0, 1.0)) @ axes.T * unit
-        if shift is None:
-            return Posterior(self.soil, covariance)
-        logs = np.zeros(len(self.soil))
-        logs[free] = np.clip(shift[free], -prior.log_std[free], prior.log_std[free])
-        return Posterior(Soil(*(np.asarray(self.soil) * np.exp(logs)).tolist()), covariance)
+        wider = Posterior(self.soil, covariance)
+        return wider if shift is None else wider.shifted(shift, prior)
+
+    def shifted(self, logs: Array, prior: SoilPrior) -> Posterior:
+        """Return the posterior with its logarithms shifted (6,), each by at most the prior's sd."""
+        step = np.clip(logs, -prior.log_std, prior.log_std)
+        return Posterior(Soil(*(np.asarray(self.soil) * np.exp(step)).tolist()), self.log_covariance)
 
     def distance(self, soil: Soil) -> float:
         """Return the Mahalanobis distance of a soil, in sd, by all free parameters together."""

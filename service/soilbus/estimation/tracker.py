@@ -3,7 +3,7 @@
     prior of a window = posterior of the newest window that had ended when it began, plus drift since,
 
         soil   covariance += drift^2 elapsed D D'     (random walk of the coordinates, D their log directions)
-        gains  variance   += gain_std^2 min((elapsed + 1) / 60, 1)
+        gains  p <- p^k p_0^(1 - k)                   (stabilised forgetting, k = exp(-1 / gain_memory) in a window)
 
     so that no sample counts twice.
 
@@ -189,7 +189,6 @@ class Tracker:
         covariance[:_SOIL, :_SOIL] = known.covariance[:_SOIL, :_SOIL]
         covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] = gains**2
         self._posteriors.append((t, Gaussian(known.soil, np.zeros(len(gains)), covariance)))
-        self._components = other.components
 
     def reset(self) -> None:
         """Forget all windows."""
@@ -311,7 +310,7 @@ class Tracker:
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - options.min_to_detect * length))
         centred = replace(last.mode, soil=last.optimum.soil, gains=last.optimum.gains)
         half_window = 0.5  # the last estimate is of its window's middle
-        predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
+        predicted = centred.drifted(self._drift(centred, half_window))
         false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
         found = change_statistic(warm.objective, predicted, warm.iterate, at.linearisation, first, false_alarms)
         if not found.is_alarm and not self.mismatch(fit):
@@ -437,10 +436,11 @@ class Tracker:
             return self._initial_prior(problem)
         end, gaussian = self._posteriors[ended[-1]]
         elapsed = (t - end) / self.settings.window + 1.0  # from the middle of that window to the middle of this one
-        gains = problem.gain_std**2 * min(elapsed / self.options.gain_memory, 1.0)
+        forgotten = 1.0 / self.options.gain_memory + (t - end) / self.options.gain_correlation_time
+        gaussian = gaussian.forgotten(math.exp(-forgotten), problem.gain_std)
         if self._state.transition is not None and end <= self._state.transition.end:
-            return gaussian.with_prior_soil(self.soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        return gaussian.drifted(self._drift(gaussian, elapsed), gains)
+            return gaussian.with_prior_soil(self.soil_prior)
+        return gaussian.drifted(self._drift(gaussian, elapsed))
 
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
         """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
@@ -477,7 +477,7 @@ class Tracker:
             return fit
         form = self._form_posterior(objective, fit)
         half = (self.options.steady_drift / 2.0) ** 2  # from a window's middle to its end
-        mode = fit.mode.drifted(self._drift(fit.mode, half), np.zeros(len(fit.gains)))
+        mode = fit.mode.drifted(self._drift(fit.mode, half))
         return replace(fit, mode=mode, form=form)
 
     def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:

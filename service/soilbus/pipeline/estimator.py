@@ -31,6 +31,7 @@ from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.instrumentation import recompleted
 from soilbus.estimation.measurements import MASS_GAIN, gains_of
 from soilbus.estimation.multistart import Fit
@@ -133,21 +134,24 @@ class WindowEstimator:
         self._driven_rig = self.rig
         self.tracker = self._new_tracker()
         """The tracker, which carries soil and gains from window to window."""
+        self._trackers = {self._apart.tobytes(): self.tracker}  # of the machine with each choice of axles
 
     def _new_tracker(self) -> Tracker:
         effects, free = self._effects_and_parameters
         return self._tracker_of(self._driven_rig, effects=effects, free=free)
 
     def _follow_clutch(self, task: WindowTask) -> Window:
-        """The window's data since an axle was engaged or disengaged; the tracker is of the machine as it is now."""
+        """The data after the hop in which an axle was engaged or disengaged; the tracker is of the machine now."""
         since = -math.inf if task.fresh else task.end - self._settings.hop
         apart = disengaged(task.window, self.rig, since, self._apart)
         if (apart != self._apart).any():
-            self._apart, self._engaged_at = apart, since
+            self._apart, self._engaged_at = apart, task.end
             self._driven_rig = with_disengaged(self.config, self.rig, apart)
-            before, self.tracker = self.tracker, self._new_tracker()
             self._gain_names, self._gain_std = gains_of(self._driven_rig)
-            self.tracker.start_from(before, since)
+            before, known = self.tracker, self._trackers.get(apart.tobytes())
+            self.tracker = self._trackers[apart.tobytes()] = known or self._new_tracker()
+            if known is None:
+                self.tracker.start_from(before, task.end)
             self._predictions = PredictionWatch(self._settings.window)
         window = task.window
         if len(window.t) and window.t[0] <= self._engaged_at:
@@ -166,17 +170,18 @@ class WindowEstimator:
         """Return soil and status of one window; windows in their order."""
         if task.fresh:
             self.tracker.reset()
-            self._engaged_at = -math.inf
+            self._trackers, self._engaged_at = {self._apart.tobytes(): self.tracker}, -math.inf
         tracked = self.tracker.estimate(self._follow_clutch(task), task.end)
         fit = tracked.fit
         self._watch_model(task, tracked)
         status, reason = self._status(task, tracked)
-        own = posterior = None
+        decided = posterior = None
         if fit is not None and status is not Status.INVALID:
-            own = posterior = fit.mode.posterior
+            decided, posterior = self._as_decided(fit).posterior, fit.mode.posterior
             if fit.form is not None:
-                prior = self.tracker.soil_prior
-                posterior = own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
+                prior, shift = self.tracker.soil_prior, fit.form.log_shift
+                decided = decided.shifted(shift, prior)
+                posterior = posterior.with_added_covariance(fit.form.log_covariance, prior, shift)
         basis, settings = self._basis(task, fit), self._settings
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
@@ -222,7 +227,7 @@ class WindowEstimator:
         here = tracked.state not in UNSETTLED
         corrections = Corrections(self._torque_ceiling(task, window), effects)
         limit = corrections.torque_limit(shared_out(task.torque_limit, self._apart, self.rig))
-        known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
+        known = None if decided is None else Posterior(decided.soil, model.with_form(decided.log_covariance))
         result = replace(result, corrections=corrections)
         return Undecided(result, known, demand, limit, window, task.fresh, model, here, rig)
 
@@ -309,6 +314,15 @@ class WindowEstimator:
         return UncertainModel.of(
             self.model, *self._effects_and_parameters, fit.mode, len(self.rig.wheels), speed, fit.form
         )
+
+    def _as_decided(self, fit: Fit) -> Gaussian:
+        """The estimate at the loads of decisions: of the mass as estimated, otherwise as configured."""
+        rig = self._driven_rig
+        rows = [] if rig.instrumentation is None else [r for r in rig.instrumentation.load if r.kind != "channel"]
+        at = np.array([self._gain_names.index(f"load.{row.name}") for row in rows], int)
+        at = at[np.asarray(self._gain_std)[at] > 0.0]
+        mass = np.array([self._gain_names[i] == MASS_GAIN for i in at], bool)
+        return fit.mode.given(at, np.where(mass, fit.gains[at], 0.0))
 
     def _as_driven(self, tracked: TrackerOutput, window: Window) -> Rig:
         """The rig with the mass that a window without load cells estimates, in reverse where the window ends so."""
