@@ -14,27 +14,11 @@ from soilbus.sensors.options import CONSISTENCY
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which wheels do not drive: without torque while another one pulls, for most of the time after `since`.
+    """Return which wheels (W,) do not drive: without torque while another pulls, for most of the time after `since`.
 
-    Parameters
-    ----------
-    window
-        A forward window.
-    rig
-        Radius of each wheel.
-    since
-        [s].
-    before
-        (W,), the result before, kept where no wheel pulls or a torque is not known.
-
-    Returns
-    -------
-    NDArray
-        (W,).  Such a wheel rolls, even if its motor reports a torque limit.
-
-    Notes
-    -----
-    Behind a shaft that drives both axles no torque of one axle is measured: there speeds say whether it is engaged.
+    The result before is kept where no wheel pulls or a torque is not known.  Such a wheel rolls, even if its motor
+    reports a torque limit.  Behind a shaft that drives both axles no torque of one axle is measured: there speeds say
+    whether it is engaged.
     """
     window = window.rows(np.flatnonzero(window.t > since))
     of_shaft, apart = _disengaged(window, rig, before)
@@ -42,10 +26,7 @@ def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> N
 
 
 def shared_out(limit: NDArray[np.float64], apart: NDArray[np.bool_], rig: Rig) -> NDArray[np.float64]:
-    """Return the torque limits (W,) [N m] where a motor's whole torque goes to the wheels that it still turns.
-
-    limit: as the motors share it out among all their wheels; apart: disengaged wheels (W,).
-    """
+    """Return the torque limits (W,) [N m] where motors turn no wheels that are `apart` (disengaged)."""
     if rig.instrumentation is None or not apart.any():
         return limit
     limit = limit.copy()

@@ -1,6 +1,6 @@
 """A posterior of the soil as a few sigma points, and mean and standard deviation of what follows from them.
 
-    log soil_d = log mode + L x_d                   x_d: points of `design` along principal directions, d = 1..D
+    log soil_d = log mode + L x_d                   x_d: points of a design along principal directions, d = 1..D
     K_L = k_c / b + k_phi                           its logarithm is linear in x_d, too; k_c is at most all of it
     f(draw) = sum_d share(draw, d) f(soil_d)        response surface (Box & Wilson 1951): polynomial through them
     mean, std of g(f)                               over 256 draws of standard normals with exact low moments
@@ -57,15 +57,9 @@ _K_C, _K_PHI, _PHI = (Soil._fields.index(name) for name in ("k_c", "k_phi", "phi
 class SigmaPoints:
     """Sigma points of a posterior and the linear map from values at them to values at its mode and draws.
 
-    Attributes
-    ----------
-    soils
-        (D, 6), the mode first.  The last points are one standard deviation away along directions that are independent
-        of all others.
-    share
-        (1 + N, D), weight of each point in the value of the mode (first row) and of each of N draws.
-    mirror
-        (D,), index of the point on the other side of the mode; its own index where there is none.
+    soils (D, 6): the mode first; the last points are one standard deviation away along directions that are independent
+    of all others.  share (1 + N, D): weight of each point in the value of the mode (first row) and of each of N draws.
+    mirror (D,): index of the point on the other side of the mode; its own index where there is none.
     """
 
     soils: Array
@@ -81,8 +75,8 @@ class SigmaPoints:
         posterior
             Soil and covariance of its logarithms.
         shifts
-            (Q, 6), changes of the logarithms that go with one standard deviation of Q other uncertain quantities.
-            Their outer products are part of the posterior's covariance.  They are the last points.
+            (Q, 6), changes of the logarithms with one standard deviation of Q other uncertain quantities, whose outer
+            products are part of the posterior's covariance.  They are the last points.
         width
             Mean tyre width b [m].  Wheels of one width determine K_L, whatever its parts: where k_phi is a small part,
             its logarithm is open, and K_L still known.  None: k_c and k_phi follow their logarithms alone.
@@ -93,29 +87,19 @@ class SigmaPoints:
         axes = directions[:, free] * np.sqrt(variance[free])
         axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
         leading = min(len(free), LEADING_DIRECTIONS)
-        points = design(leading)
+        points = _design(leading)
         steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, along])
         soils = np.asarray(posterior.soil) * np.exp(steps)
         if width is not None:
-            soils[:, [_K_C, _K_PHI]] = moduli(posterior.soil, steps, width)
+            soils[:, [_K_C, _K_PHI]] = _moduli(posterior.soil, steps, width)
         soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
         return cls(soils, *_shares(leading, len(soils) - len(points)))
 
     def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
-        """Return values at the mode and the draws, from values at the points.
+        """Return values at the mode and the draws (1 + N, ..., F), from values at the points (D, ..., F).
 
-        Parameters
-        ----------
-        samples
-            (D, ..., F), values at the points.
-        known
-            Broadcastable to samples; None if all are known.  A value that is not known is mirrored about the mode's
-            from the point on the other side; where that is not known either, it is the mode's.
-
-        Returns
-        -------
-        Array
-            (1 + N, ..., F).  Of a result with three axes the second varies slowest in memory.
+        A value that is not known (a mask that broadcasts; None if all are) is mirrored about the mode's from the point
+        on the other side; where that is not known either, it is the mode's.
         """
         if known is not None and not known.all():
             known = np.broadcast_to(known, samples.shape)
@@ -126,8 +110,8 @@ class SigmaPoints:
         return np.asarray(self.share @ samples.reshape(len(samples), -1)).reshape(-1, *samples.shape[1:])
 
 
-def moduli(soil: Soil, steps: Array, width: float) -> Array:
-    """Return k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
+def _moduli(soil: Soil, steps: Array, width: float) -> Array:
+    """k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
     part, whole = soil.k_c / width, soil.k_c / width + soil.k_phi
     K_L = whole * np.exp((part * steps[:, _K_C] + soil.k_phi * steps[:, _K_PHI]) / whole)
     of_k_c = np.minimum(part * np.exp(steps[:, _K_C]), (1.0 - LEAST_K_PHI) * K_L)
@@ -135,17 +119,10 @@ def moduli(soil: Soil, steps: Array, width: float) -> Array:
 
 
 def mean_and_std(samples: Array) -> tuple[Array, Array]:
-    """Return the mean and standard deviation over the draws.
+    """Return the mean and standard deviation (...,) over the draws that have a value.
 
-    Parameters
-    ----------
-    samples
-        (1 + N, ...), the value at the mode, then at the draws; nan where a draw has no value.
-
-    Returns
-    -------
-    mean, std
-        (...,) each, over the draws that have a value; nan where the mode or most draws have none.
+    samples (1 + N, ...): the value at the mode, then at the draws, nan where there is none; both are nan where the mode
+    or most draws have none.
     """
     change = samples[1:] - samples[0]
     known = np.isfinite(change)
@@ -176,21 +153,13 @@ def estimates(*samples: Array | None) -> list[Estimate | None]:
 def likely(samples: Array | None) -> Estimate | None:
     """Return a first-order estimate of a scalar: its value at the mode and the std of its odd part.
 
-    Parameters
-    ----------
-    samples
-        (1 + N,), the value at the mode, then at pairs of a draw and its mirror image; nan where there is no value (then
-        the mirror image's is mirrored about the mode's).  None without samples.
+    samples (1 + N,): the value at the mode, then at pairs of a draw and its mirror image; nan where there is no value
+    (then the mirror image's is mirrored about the mode's).  None without samples.
 
-    Notes
-    -----
-    Mean-value first-order reliability.  It has no second-order term, so it gives the median of a monotonic function.
-    The mean would not do for probabilities: poorly determined soils lie along a curved valley of the likelihood, which
-    straight principal directions leave, and the second-order term there looks like a certain increase.
-
-    References
-    ----------
-    Cornell 1969, A probability-based structural code, ACI Journal 66:974.
+    Mean-value first-order reliability (Cornell 1969, ACI Journal 66:974).  It has no second-order term, so it gives the
+    median of a monotonic function.  The mean would not do for probabilities: poorly determined soils lie along a curved
+    valley of the likelihood, which straight principal directions leave, and the second-order term there looks like a
+    certain increase.
     """
     if samples is None:
         return None
@@ -198,21 +167,16 @@ def likely(samples: Array | None) -> Estimate | None:
     change = np.where(np.isnan(change), -change[:, ::-1], change)
     odd = 0.5 * (change[:, 0] - change[:, 1])
     known = odd[np.isfinite(odd)]
-    return _known(float(samples[0]), math.sqrt(float((known**2).sum()) / max(len(known), 1)))
+    value, std = float(samples[0]), math.sqrt(float((known**2).sum()) / max(len(known), 1))
+    return Estimate(value, std) if math.isfinite(value) else None
 
 
 @cache
-def design(n: int) -> Array:
-    """Return the design points (P, n) for n independent standard normals, the origin first.
+def _design(n: int) -> Array:
+    """The design points (P, n) for n independent standard normals, the origin first (Lu & Darmofal 2004).
 
-    Notes
-    -----
     The vertices of a regular simplex, their mirror images and the middles of its edges, all projected on one sphere;
     then the points of the first axis, on which one vertex also lies.
-
-    References
-    ----------
-    Lu & Darmofal 2004, SIAM J. Sci. Comput. 26:613 (the cubature).
     """
     if n == 0:
         return np.zeros((1, 0))
@@ -230,24 +194,11 @@ def design(n: int) -> Array:
 
 @cache
 def normals(n: int, leading: int) -> Array:
-    """Return the draws of n standard normals with exact low moments.
+    """Return draws (DRAWS, n) of n standard normals, each next to its mirror image; their covariance is the identity.
 
-    Parameters
-    ----------
-    n
-        Number of columns.
-    leading
-        Number of columns that have all moments of standard normals up to degree five; the first one up to seven.
-
-    Returns
-    -------
-    Array
-        (DRAWS, n), each draw next to its mirror image; the covariance is the identity.
-
-    Notes
-    -----
-    Pseudo-random draws, moved by least-norm Gauss-Newton steps until the moments hold: so polynomials of them have
-    nearly the right variance.
+    The leading columns have all moments of standard normals up to degree five, the first one up to seven: pseudo-random
+    draws, moved by least-norm Gauss-Newton steps until these hold.  So polynomials of them have nearly the right
+    variance.
     """
     if n == 0:
         return np.zeros((DRAWS, 0))
@@ -267,7 +218,7 @@ def normals(n: int, leading: int) -> Array:
 @cache
 def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
     """share and mirror of SigmaPoints for these numbers of polynomial (leading) and linear directions."""
-    points = design(leading)
+    points = _design(leading)
     z = normals(leading + linear, leading)
     fit = np.linalg.pinv(_polynomials(points))
     of_draws = np.concatenate([_polynomials(z[:, :leading]) @ fit, z[:, leading:]], axis=1)
@@ -280,10 +231,10 @@ def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _polynomials(x: Array) -> Array:
-    """Orthonormal polynomials of standard normals (P, n): (P, terms).
+    """Orthonormal polynomials (P, terms) of standard normals (P, n), all up to degree two and some more.
 
-    All of degree up to two, those of the first column up to FIRST_AXIS_DEGREE, and its square times each other column
-    (not with two columns, where the points cannot separate that product from the other column itself).
+    More are those of the first column up to FIRST_AXIS_DEGREE, and its square times each other column (not with two
+    columns, where the points cannot separate that product from the other column itself).
     """
     n = x.shape[1]
     degrees = [d for d in itertools.product(range(3), repeat=n) if sum(d) <= 2]
@@ -313,7 +264,3 @@ def _monomials(z: Array, degrees: NDArray[np.intp]) -> tuple[Array, Array]:
     lower = np.maximum(degrees[:, None] - np.eye(len(column), dtype=int), 0)
     slopes = degrees[..., None] * powers[lower, :, column].prod(axis=2)
     return value, slopes.transpose(0, 2, 1)
-
-
-def _known(value: float, std: float) -> Estimate | None:
-    return Estimate(value, std) if math.isfinite(value) else None

@@ -34,16 +34,15 @@ LEAST_BINS = 4
 class TorqueCeiling:
     """Each wheel's (W,) ceiling, as measured in one recording; `after` takes the next window.
 
-    t [s]: end of the last span.  highest [N m]: largest mean of a span.  level [N m]: of the plateau on which the
-    wheel was saturated, nan without one; weight [1/(N m)^2]: the inverse variance of level.  lasts: the torque has not
-    been below the level since.  unmet: the vehicle lost speed on this plateau, and has not gained any since.  returned:
-    the torque was below the level, and the wheel was saturated at this level again.
+    t [s]: end of the last span.  highest [N m]: largest mean of a span.  level [N m]: of the plateau on which the wheel
+    was saturated last, nan without one.  lasts: the torque has not been below the level since.  unmet: the vehicle lost
+    speed on this plateau, and has not gained any since.  returned: the torque was below the level, and the wheel was
+    saturated at this level again.
     """
 
     t: float
     highest: Array
     level: Array
-    weight: Array
     lasts: Mask
     unmet: Mask
     returned: Mask
@@ -52,7 +51,7 @@ class TorqueCeiling:
     def unknown(cls, wheels: int) -> TorqueCeiling:
         """Return the state before any measurement."""
         no = np.zeros(wheels, bool)
-        return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), np.zeros(wheels), no, no, no)
+        return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), no, no, no)
 
     @property
     def limit(self) -> Array:
@@ -60,18 +59,10 @@ class TorqueCeiling:
         return np.where((self.lasts & self.unmet) | self.returned, self.level, np.nan)
 
     def after(self, window: Window, rig: Rig, span: float, deviations: float) -> TorqueCeiling:
-        """Return the ceiling after one more window, of which only new spans count.
+        """Return the ceiling after one more forward window with the true draft, of which only new spans count.
 
-        Parameters
-        ----------
-        window
-            A forward window, with the true draft.
-        rig
-            With a chassis, else nothing is known of the pull.
-        span
-            [s], length of a plateau, and time between two evaluations.
-        deviations
-            Standard deviations from which a difference is significant.
+        span [s]: length of a plateau, and time between two evaluations.  deviations: sd from which a difference is
+        significant.
         """
         if rig.chassis is None or not len(window.t):
             return self
@@ -86,27 +77,20 @@ class TorqueCeiling:
     def _after_span(self, window: Window, rig: Rig, deviations: float) -> TorqueCeiling:
         if len(window.t) < LEAST_BINS:
             return self
-        variance = window.variance["torque"].mean(axis=0)
-        torque, var = window.torque.mean(axis=0), variance / len(window.t)
-        saturated = _saturated(window, rig, deviations)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            noise = deviations * np.sqrt(var + np.where(self.weight > 0.0, 1.0 / self.weight, np.inf))
+        torque, var = window.torque.mean(axis=0), window.variance["torque"].mean(axis=0) / len(window.t)
+        with np.errstate(invalid="ignore"):
+            noise = deviations * np.sqrt(2.0 * var)
             exceeded, below = torque - self.level > noise, self.level - torque > noise
-            saturated &= self.highest - torque <= deviations * np.sqrt(2.0 * var)
+            saturated = _saturated(window, rig, deviations) & (self.highest - torque <= noise)
         known = np.isfinite(self.level) & ~exceeded
         same = saturated & known & ~below
-        new = np.divide(1.0, var, out=np.zeros_like(var), where=saturated)
-        weight = np.where(known & (same | ~saturated), self.weight, 0.0) + new
-        share = np.divide(new, weight, out=np.zeros_like(weight), where=saturated)
-        level = np.where(known & (same | ~saturated), self.level, np.where(saturated, torque, np.nan))
-        level = np.where(saturated, level + share * (torque - level), level)
+        level = np.where(saturated, torque, np.where(known, self.level, np.nan))
         gain, of_noise = _speed_gained(window, deviations)
         lasts = saturated | (self.lasts & known & ~below)
         return replace(
             self,
             highest=np.fmax(self.highest, torque),
             level=level,
-            weight=weight,
             lasts=lasts,
             unmet=lasts & ((self.unmet & (gain < of_noise)) | (saturated & (gain < -of_noise))),
             returned=known & (self.returned | (same & ~self.lasts)),

@@ -56,10 +56,8 @@ class Traversability:
         The decision, and the probability that pull and sinkage stay within their limits.
     torque_required, torque_available
         [N m], sums over the wheels.
-    max_draft
-        [N], on the level.
-    max_grade
-        [rad], without draft.
+    max_draft, max_grade
+        [N] on the level, and [rad] without draft.
     slip_needed
         Slip at which the present demand is met.
     limit
@@ -110,21 +108,8 @@ class Held:
 
 
 def settled(last: Held, probability: float | None, status: Status, settings: Settings) -> Held:
-    """Return the state in force after one more window.
+    """Return the state in force after one more window of this probability (None: unknown) and status.
 
-    Parameters
-    ----------
-    last
-        The state before.
-    probability
-        Of the window's decision; None is unknown.
-    status
-        Of the window.
-    settings
-        Thresholds, `hold` and `hysteresis`.
-
-    Notes
-    -----
     Unknown and worse states take effect at once.  After unknown, any state does.
     """
     if probability is None:

@@ -70,16 +70,12 @@ class UncertainModel:
 
         Parameters
         ----------
-        model
-            Wheel-soil model without effects.
-        effects, free
-            The effects, and their free parameters.
+        model, effects, free
+            Wheel-soil model without effects, the effects, and their free parameters.
         gaussian
             Posterior of soil and gains; the last len(free) gains are the free parameters in prior standard deviations.
-        n_wheels
-            Number of wheels.
-        ground_speed
-            [m/s], at which effects are evaluated; only those that act in steady driving have a perturbed model.
+        n_wheels, ground_speed
+            Number of wheels; speed [m/s] of steady driving: only effects that act there have a perturbed model.
         form
             Posterior of the model's form; None where it is not uncertain.
         """
@@ -92,11 +88,7 @@ class UncertainModel:
         mean = at(standardised)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
-        of_form = (
-            [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, with_form_step(model, step)))
-        )
-        if not len(places):
-            return cls(mean, tuple(of_form), len(of_form))
+        of_form = [] if form is None else _by_form(form, lambda step: at(standardised, with_form_step(model, step)))
         of_effects = _SOIL + first + places
         variance, axes = np.linalg.eigh(gaussian.covariance[np.ix_(of_effects, of_effects)])
         perturbed = []
@@ -127,7 +119,7 @@ class UncertainModel:
         return ModelOfRows((self.mean, *[one.model for one in self.perturbed]), row)
 
 
-def _perturbed_by_form(form: FormPosterior, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
+def _by_form(form: FormPosterior, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
     """A perturbed model for each leading direction of the form's second moment, on the side on which its mean lies."""
     variance, axes = np.linalg.eigh(form.moment)
     axes = axes * np.where(form.mean @ axes < 0.0, -1.0, 1.0)

@@ -24,11 +24,10 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.driveline import disengaged, idle, shared_out
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.moments import bins_of_a_moment, moments
-from soilbus.decision.options import WATCH
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
-from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
+from soilbus.decision.watch import Alert, Warnings, Watch, curve_age, ended, watched
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
 from soilbus.estimation.instrumentation import recompleted
@@ -296,7 +295,7 @@ class WindowEstimator:
         bins = bins_of_a_moment(settings.bin)
         for moment in moments(driven, self.rig, window.torque_limit, self.config, chosen, bins):
             curve, t = self._curve
-            known = curve if moment.t - t < WATCH.curve_age else None
+            known = curve if moment.t - t < curve_age(self.config) else None
             self._watch = watched(self._watch, moment, known, self.config)
             self._warnings = self._warnings.after(moment.t, self._watch.warning)
 
