@@ -11,6 +11,7 @@ by cubic Hermite interpolation.  Everything is computed for all soils of a poste
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple
@@ -23,20 +24,6 @@ from soilbus.decision.sigma_points import SigmaPoints
 from soilbus.decision.uncertain_model import ModelOfRows
 from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
-
-__all__ = [
-    "LEVEL",
-    "Balance",
-    "BetweenSlips",
-    "Duty",
-    "Largest",
-    "Limits",
-    "axle_sum",
-    "balance",
-    "largest_pull",
-    "point_of_pull",
-    "slips_of_most",
-]
 
 SUBDIVISIONS = 5
 """Parts into which each step of the slip grid is divided."""
@@ -163,23 +150,6 @@ class Largest(NamedTuple):
     cause: Cause
 
 
-class BetweenSlips(NamedTuple):
-    """A point between two slips of a balance, for each soil (D,).
-
-    before: index of the slip before it; share: of the step to the next slip, nan where there is no such point.
-    """
-
-    before: NDArray[np.intp]
-    share: Array
-
-    def on(self, values: Array) -> Array:
-        """Return values (D, ..., F) interpolated linearly at the point: (D, ...)."""
-        row = np.arange(len(values))
-        here, there = values[row, ..., self.before], values[row, ..., self.before + 1]
-        share = self.share.reshape(-1, *(1,) * (here.ndim - 1))
-        return np.asarray(here + share * (there - here))
-
-
 def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None) -> Balance:
     """Return the steady states under a duty, on a slip grid SUBDIVISIONS times as fine as the table's.
 
@@ -235,17 +205,24 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
 
 
-def point_of_pull(balance: Balance, pull: float) -> BetweenSlips:
-    """Return the least slip at which each soil gives this pull [N]: the first slip if it gives more, else none."""
+def at_pull(balance: Balance, pull: float) -> Callable[[Array], Array]:
+    """Return a function that interpolates values (D, ..., F) to the least slip at which each soil gives a pull [N].
+
+    That is the first slip where it gives more; where none does, the values are nan.
+    """
     enough = balance.known & (balance.pull >= pull)
-    first = enough.argmax(axis=1)
-    before = np.maximum(first - 1, 0)
-    row = np.arange(len(first))
+    row, before = np.arange(len(enough)), np.maximum(enough.argmax(axis=1) - 1, 0)
     low, high = balance.pull[row, before], balance.pull[row, before + 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.clip((pull - low) / (high - low), 0.0, 1.0)
     share = np.where(balance.known[row, before], share, 1.0)
-    return BetweenSlips(before, np.where(enough.any(axis=1), share, np.nan))
+    share = np.where(enough.any(axis=1), share, np.nan)
+
+    def on(values: Array) -> Array:
+        here, there = values[row, ..., before], values[row, ..., before + 1]
+        return np.asarray(here + share.reshape(-1, *(1,) * (here.ndim - 1)) * (there - here))
+
+    return on
 
 
 def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -> Array:
@@ -272,12 +249,6 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
     return np.where(usable[quantity, row, best], np.where(inside, vertex, at_end), np.nan)
 
 
-def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
-    """Return the sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), times a factor (A, 1)."""
-    share = (axles.count * each)[:, 0]
-    return np.asarray(np.einsum("a,daf->df", share[kinds], values[:, kinds]))
-
-
 def _columns(pull: Array, at: Array) -> Array:
     """Pull (D, S), then pulls, torques and entry angles by kind (3, D, A, S): (D, 1 + 3 A, S), 0 where not known."""
     columns = np.concatenate([pull[:, None], *at], axis=1)
@@ -286,10 +257,7 @@ def _columns(pull: Array, at: Array) -> Array:
 
 @cache
 def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
-    """The fine slips (F,), the grid's step in which each lies (F,), and three matrices (S, F) of cubic interpolation.
-
-    They are of values, of slopes, and of values whose slopes are second-order differences.
-    """
+    """Fine slips (F,), the step of each, and matrices (S, F) that interpolate by values, by slopes, by values alone."""
     slip = np.array(slips)
     place = np.arange(SUBDIVISIONS * (len(slip) - 1) + 1) / SUBDIVISIONS
     cell = np.minimum(place.astype(int), len(slip) - 2)

@@ -5,8 +5,8 @@
     forecast         the least slip with pull(s) = demand, its sinkage and torque
     efficiency       eta(s) = P (1 - s) / (T / r)         drawbar power over axle power, the set point of each axle
 
-`assess` takes the posterior's sigma points, computes the wheels over slip on each of them (`wheels`, `balance`), maps
-the results to the posterior's mode and draws, and finds each quantity draw by draw: `sigma_points` gives mean and std.
+The wheels over slip (`wheels`, `balance`) are computed on the posterior's sigma points and mapped to its mode and
+draws; each quantity is found draw by draw, and `sigma_points` gives its mean and std.
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ from soilbus.decision.balance import (
     Duty,
     Largest,
     Limits,
-    axle_sum,
+    at_pull,
     balance,
     largest_pull,
-    point_of_pull,
     slips_of_most,
 )
 from soilbus.decision.sigma_points import SigmaPoints, estimates, likely, mean_and_std
@@ -231,11 +230,7 @@ class _Vehicle(NamedTuple):
     skid: Callable[[], WheelTable]
 
     def largest(self, duty: Duty, driving: Balance) -> Largest | None:
-        """Largest pull of each draw under a duty; None where nothing is within the limits.
-
-        Where the least slip already needs more torque than the limit, the wheels skid: the pull is negative, and only
-        a push or a slope moves the vehicle.  It is the least pull where every skid needs too much torque.
-        """
+        """Largest pull of each draw under a duty, skidding where motors are weak; None if the mode has none."""
         found = largest_pull(driving, self.limits)
         if not self.table.axles.driven.any():
             return found._replace(cause="torque")
@@ -275,12 +270,12 @@ def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) ->
     none = {name: SetPoint(None, None) for name, kinds in of_axles.items() if kinds.any()}
     if not names:
         return none
-    values = np.empty((len(names), 2, *level.pull.shape))
-    for (efficiency, pull), kinds in zip(values, names.values(), strict=True):
-        force = axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
-        pull[:] = axle_sum(level.drawbar, axles, kinds)
-        np.divide(pull * (1.0 - level.slip), np.where(force > 0.0, force, -np.inf), out=efficiency)
-    slips = estimates(*slips_of_most(values.reshape(-1, *level.pull.shape), level, limits, draft.slip))
+    values = []
+    for kinds in names.values():
+        force = (axles.count[kinds] / axles.radius[kinds] * level.torque[:, kinds]).sum(axis=1)
+        pull = (axles.count[kinds] * level.drawbar[:, kinds]).sum(axis=1)
+        values += [pull * (1.0 - level.slip) / np.where(force > 0.0, force, -np.inf), pull]
+    slips = estimates(*slips_of_most(np.stack(values), level, limits, draft.slip))
     return none | {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
@@ -288,12 +283,12 @@ def _forecast(
     demand: Demand, here: Balance, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
 ) -> Forecast | None:
     """Slip, sinkage and torque at the least slip that gives the demand; None where most likely no slip does."""
-    point = point_of_pull(present, demand.pull)
-    torque = (point.on(present.torque) * axles.count[:, 0]).sum(axis=1)
-    slip = point.on(np.broadcast_to(present.slip, present.pull.shape))
+    on = at_pull(present, demand.pull)
+    torque = (on(present.torque) * axles.count[:, 0]).sum(axis=1)
+    slip = on(np.broadcast_to(present.slip, present.pull.shape))
     load = axles.loads(*Duty(None, demand.sine).split(here.pull, axles.weight))
     depth = model.sinkage(here.angle, Wheel(axles.radius, axles.width, ~axles.front, load))
-    depth = point.on(points.drawn(depth, here.known[:, None]))
+    depth = on(points.drawn(depth, here.known[:, None]))
     slip_needed, required, *depths = estimates(slip, torque, *depth.T)
     likely_depth = likely(depth[:, int(np.argmax(depth[0]))])
     if slip_needed is None or required is None or likely_depth is None:

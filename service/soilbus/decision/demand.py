@@ -54,10 +54,7 @@ def _over(window: Window, chassis: Chassis, gain: Estimate) -> Demand:
 
 
 def _gravity_felt(window: Window) -> tuple[float, float]:
-    """Mean g sin(pitch) [m/s^2] that a specific force f shows, and its variance; 0 and 0 where it shows none.
-
-    d/dt (V - integral of f) = -g sin(pitch): minus the slope of a line, whose weights on f add up to one as well.
-    """
+    """Mean g sin(pitch) [m/s^2] and its variance, 0 where not known: -d/dt (V - integral of specific force)."""
     known = np.isfinite(window.acceleration) & np.isfinite(window.ground_speed)
     if np.count_nonzero(known) < LEAST_BINS:
         return 0.0, 0.0

@@ -4,8 +4,7 @@
     P(depth)    = Phi((max_sinkage - sinkage of the deepest wheel) / sd)
     P           = min(P(pull), P(depth)) -> go, caution or no_go by the configured thresholds
 
-`judge` decides when a window ends.  `at_present` says what remains of that decision later, when its data have aged, the
-vehicle has moved on, or the wheels show less pull than predicted.
+`judge` decides when a window ends; `at_present` says what remains of it later.
 """
 
 from __future__ import annotations
@@ -42,20 +41,9 @@ def judge(
 ) -> tuple[Traversability, WheelTable | None]:
     """Return whether the vehicle can go on, on the ground of one window, and the table to start the next one from.
 
-    Parameters
-    ----------
-    posterior, status
-        Of the window's soil; None where there is no estimate.
-    demand
-        Draft and slope; None where not known.  Only a valid status and a known demand can give go.
-    rig, model
-        The vehicle and its wheel-soil model.
-    torque_limit
-        (W,) [N m], nan where not known.
-    settings
-        Limits of slip and sinkage, margin, thresholds.
-    last
-        The table of the window before, to start from.
+    posterior, status: of the window's soil, None where there is no estimate.  demand: draft and slope, None where not
+    known; only a valid status and a known demand can give go.  torque_limit (W,) [N m]: nan where not known.  settings:
+    limits of slip and sinkage, margin, thresholds.  last: the table of the window before, to start from.
     """
     available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
     if posterior is None or status is Status.INVALID or rig.chassis is None:
@@ -113,27 +101,14 @@ class Basis(NamedTuple):
 def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float, config: Config) -> Traversability:
     """Return a window's decision as far as it holds at a later time.
 
-    A decision is valid for the time and place of its data, and is overruled by what the wheels show:
+    - stuck: no_go, and no figure of the estimate; - with a wheel that spins, or while immobilisation is warned of: no
+    better than caution; - data older than `max_age`, or on ground further back than the wheelbase, behind which the
+    rear wheels stand: unknown; - wheels that pull less at their present slip than the estimate predicts: the spare pull
+    is reduced by the miss; - wheels that slip more than the present pull needs, or the forecast where it is not known:
+    no better than caution; - with less than `min_share` of a window measured since a wheel last spun: no better than
+    caution.
 
-    - stuck: no_go, and no figure of the estimate;
-    - with a wheel that spins, or while immobilisation is warned of: no better than caution;
-    - data older than `max_age`, or on ground further back than the wheelbase: unknown;
-    - wheels that pull less at their present slip than the estimate predicts: the spare pull is reduced by the miss;
-    - wheels that slip more than the present pull needs by the estimate, or the forecast where that pull is not known:
-      no better than caution;
-    - with less than `min_share` of a window measured since a wheel last spun: no better than caution.
-
-    Parameters
-    ----------
-    decision, basis
-        The decision when the window ended, and its data.
-    watch
-        As of now: what wheels and vehicle do, and whether immobilisation is warned of.
-    now
-        [s], the time of the data.
-    config
-        `max_age`, `min_share`, `contradiction`, gain errors, and the wheelbase, after which rear wheels stand where
-        front wheels stood.
+    now [s]: the time of the data.  watch: as of then.
     """
     settings, length = config.traversability, 0.0 if config.vehicle is None else config.vehicle.wheelbase
     if watch.stuck:
@@ -159,7 +134,7 @@ def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float,
         if math.isfinite(watch.pull):
             predicted = curve.slip_needed(watch.pull)
         if predicted is not None:
-            sd = math.hypot(predicted.std, curve.slip_std(watch.slip), config.warning.slip_noise)
+            sd = math.hypot(predicted.std, (1.0 - watch.slip) * curve.slip_gain, config.warning.slip_noise)
             if watch.slip - predicted.value > settings.contradiction * sd:  # nor nan
                 return replace(decision, state=State.CAUTION, probability=None, contradicted="slip")
     measured = np.count_nonzero(basis.instants > watch.last) * basis.each
@@ -183,17 +158,13 @@ class _Curve(NamedTuple):
         gain = math.hypot(noise.speed.gain, noise.ground_speed.gain)
         return cls(curve.slip[known], curve.pull[known], curve.pull_std[known], gain, noise.draft.gain)
 
-    def slip_std(self, slip: float) -> float:
-        """Std of a measured slip."""
-        return (1.0 - slip) * self.slip_gain
-
     def missing_pull(self, slip: float, pull: float, deviations: float) -> float:
         """Pull [N] by which the wheels give less than predicted at their slip, beyond so many sd of this innovation."""
         if not len(self.slip) or not math.isfinite(slip + pull) or slip < self.slip[0]:
             return 0.0
         predicted, std = float(np.interp(slip, self.slip, self.pull)), float(np.interp(slip, self.slip, self.std))
         slope = float(np.interp(slip, self.slip, np.gradient(self.pull, self.slip))) if len(self.slip) > 1 else 0.0
-        sd = math.hypot(std, slope * self.slip_std(slip), self.draft_gain * pull)
+        sd = math.hypot(std, slope * (1.0 - slip) * self.slip_gain, self.draft_gain * pull)
         return max(predicted - pull - deviations * sd, 0.0)
 
     def slip_needed(self, pull: float) -> Estimate | None:

@@ -23,8 +23,6 @@ from soilbus.decision.stall import LONGEST_GAP
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
 
-__all__ = ["Margin", "left_by"]
-
 
 class Margin(NamedTuple):
     """Share of the ground's capacity that is left; `left_by` makes the next one.
@@ -120,10 +118,7 @@ def _known(curve: OverSlip) -> tuple[Array, Array, Array, float]:
 
 
 def _time_to_weaken(x: Array, capacity: Array, reserve: Array, peak: float, options: WatchOptions) -> float:
-    """Time [s] until the capacity falls to the greatest demand [N]; inf where it does not surely fall.
-
-    C = c + b x + e R: where the curve's reserve R is wrong by a share e of sd `form_error`, the capacity follows slip.
-    """
+    """Time [s] until c + b x + e R falls to the peak [N] of demand, e: error of the reserve R; inf if not sure."""
     known = np.isfinite(capacity)
     x, capacity, reserve = x[known], capacity[known], reserve[known]
     lag = options.scatter_lag

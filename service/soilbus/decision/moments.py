@@ -4,9 +4,8 @@
     resistance                 (sum(T / r) - pull) / (m g)
     common slip                e^(-b s) = mean of e^(-b s_w)      mu = mu_max (1 - e^(-b s)) (Brixius 1987)
 
-Wheels on a differential share a torque: as load shifts between them, the lighter one gains more slip than the other
-loses, and their mean slip grows at the same pull.  The common slip, at which both would give what they give, hardly
-grows.
+Wheels on a differential share a torque: as load shifts between them, their mean slip grows at the same pull.  The
+common slip, at which both would give what they give, hardly grows.
 """
 
 from __future__ import annotations
@@ -23,8 +22,6 @@ from soilbus.config.model import Config
 from soilbus.decision.options import WATCH
 from soilbus.estimation.window import Rig, Window, inertia_of, pairs, pull_given
 from soilbus.terra.vehicle import GRAVITY, slip_ratio
-
-__all__ = ["Moment", "Sample", "bins_of_a_moment", "common_slip", "moment_of", "moments"]
 
 
 class Sample(NamedTuple):
@@ -54,30 +51,14 @@ class Sample(NamedTuple):
 class Moment(NamedTuple):
     """Means of the readings over some bins; nan where not known.
 
-    Attributes
-    ----------
-    t
-        [s], of the last bin.
-    ground, rim, beside
-        [m/s], ground speed of the vehicle's middle, rim speed of each wheel that a motor can drive, and ground speed of
-        each of these less that of the middle (on a curve).
-    resistance
-        Thrust less draft, slope and inertia, as a share of the weight.
-    at_limit
-        Every motor whose limit is known is at its limit, and at least one limit is known.
-    slip, common
-        Torque-weighted mean of the driving wheels, and common slip of all that do drive.
-    given, inertia, pull
-        [N], pull as far as it is measured, the part of it that speeds the vehicle up, and all of it, nan where no
-        acceleration is measured.
-    last
-        The last bin by itself.
-    torque, reserve
-        [N m], of each wheel that a motor can drive; whether it is known to be below its limit.
-    engaged
-        Which of all wheels drive.
-    mass
-        [kg], of the vehicle.
+    t [s]: of the last bin.  ground, rim, beside [m/s]: ground speed of the vehicle's middle, rim speed of each wheel
+    that a motor can drive, and ground speed of each of these less that of the middle (on a curve).  resistance: thrust
+    less draft, slope and inertia, as a share of the weight.  at_limit: every motor whose limit is known is at its
+    limit, and at least one limit is known.  slip, common: torque-weighted mean of the driving wheels, and common slip
+    of all that do drive.  given, inertia, pull [N]: pull as far as it is measured, the part of it that speeds the
+    vehicle up, and all of it, nan where no acceleration is measured.  last: the last bin by itself.  torque [N m],
+    reserve: of each wheel that a motor can drive, and whether it is known to be below its limit.  engaged: which of all
+    wheels drive.  mass [kg].
     """
 
     t: float
@@ -121,19 +102,9 @@ def moments(
 ) -> list[Moment]:
     """Return the means at some bins of a forward window, each over the last bins there.
 
-    Parameters
-    ----------
-    window, rig
-        A forward window; without chassis and wheels there are no moments.
-    torque_limit
-        (W,) [N m], nan where not known, 0 of a wheel that rolls freely.
-    config
-        `full_torque`, share of the limit from which a motor is at its limit; `min_speed` [m/s], ground speed up to
-        which slip is nan.
-    chosen
-        (M,), the bins at which each mean ends.
-    bins
-        Over how many each mean goes, fewer at the window's begin.
+    torque_limit (W,) [N m]: nan where not known, 0 of a wheel that rolls freely.  config: `full_torque`, `min_speed`,
+    up to which slip is nan.  chosen (M,): the bins at which each mean ends.  bins: over how many, fewer at the window's
+    begin.
     """
     if not len(chosen) or rig.chassis is None or not rig.wheels:
         return []
@@ -145,6 +116,10 @@ def moments(
     slips = np.where(slips > -1.0, slips, np.nan)
     if rig.instrumentation is not None:
         slips[:, rig.instrumentation.without_speed] = np.nan  # their speed is assumed
+    lever = np.zeros(len(radius))  # by which a yaw rate, positive to the left, adds to a wheel's ground speed
+    if rig.track is not None:
+        left, right = pairs(rig)
+        lever[left], lever[right] = -rig.track / 2.0, rig.track / 2.0
     inertia = np.where(np.isfinite(given), inertia_of(window, rig.chassis), np.nan)
     n, w = 4, len(radius)
     columns = np.column_stack(
@@ -158,7 +133,7 @@ def moments(
         means = np.where(known, taken, 0.0).sum(axis=1) / known.sum(axis=1)
         ground, given, inertia, yaw_rate = means[:, :n].T
         rim, torque, slips = means[:, n : n + w], means[:, n + w : n + 2 * w], means[:, n + 2 * w :]
-        beside = _side(rig) * np.where(np.isfinite(yaw_rate), yaw_rate, 0.0)[:, None]
+        beside = lever * np.where(np.isfinite(yaw_rate), yaw_rate, 0.0)[:, None]
         limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
         full = torque >= config.traversability.full_torque * torque_limit
         at_limit = limited.any() & (full | ~limited).all(axis=1)
@@ -210,12 +185,3 @@ def _samples(window: Window, rig: Rig, beside: Array, at_limit: NDArray[np.bool_
         window.draft / weight,
     )
     return list(map(Sample, *(column.tolist() for column in columns)))
-
-
-def _side(rig: Rig) -> Array:
-    """Lever [m] (W,) by which a yaw rate, positive to the left, adds to a wheel's ground speed; 0 without a track."""
-    lever = np.zeros(len(rig.wheels))
-    if rig.track is not None:
-        left, right = pairs(rig)
-        lever[left], lever[right] = -rig.track / 2.0, rig.track / 2.0
-    return lever

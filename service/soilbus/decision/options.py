@@ -2,15 +2,12 @@
 
     WatchOptions -> watch.watched, stall.stalling, margin.left_by, moments.moments
 
-What a change of 30 % does to each is in service/docs/sensitivity.md.  What an operator may want to change is in
-`config.model.Warning`.
+What a change of 30 % does to each: service/docs/sensitivity.md.  What an operator may change: `config.model.Warning`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-__all__ = ["WATCH", "WatchOptions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +16,7 @@ class WatchOptions:
 
     moment_span: float = 0.3
     """Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake
-    at 1.5 to 3 Hz.  With 0.12 s one bogging less was warned of in time on two of three machines (122 boggings, seed 71).
-    """
+    at 1.5 to 3 Hz.  With 0.12 s one of 122 boggings less was warned of in time on two of three machines (seed 71)."""
     slip_exponent: float = 7.5
     """b [1]: gross traction ratio mu = mu_max (1 - e^(-b s)) over slip s (Brixius 1987, tyres in fields)."""
     settling_time: float = 2.0

@@ -5,11 +5,10 @@
     f(draw) = sum_d share(draw, d) f(soil_d)        response surface (Box & Wilson 1951): polynomial through them
     mean, std of g(f)                               over 256 draws of standard normals with exact low moments
 
-The leading principal directions of the logarithms' covariance have a polynomial.  The first is the ridge on which k_c,
-k_phi and n replace each other (sd 0.3 to 1.6): forces are strongly nonlinear along it, so it has points of its own and
-degree 6.  The other directions are known so well that everything is linear in them: one point each.  Forces over slip
-(f) are smooth in the soil.  What the vehicle can do (g) is not: a torque limit ends the pull before the ground does,
-and the best slip jumps from one maximum to another.  So g is evaluated draw by draw.
+The first principal direction of the logarithms' covariance is the ridge on which k_c, k_phi and n replace each other
+(sd 0.3 to 1.6): forces are strongly nonlinear along it, so it has points of its own and degree 6.  In directions behind
+the leading ones everything is linear: one point each.  Forces over slip (f) are smooth in the soil.  What the vehicle
+can do (g) is not: a torque limit ends the pull before the ground does.  So g is evaluated draw by draw.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.polynomial.hermite_e import hermeval
+from numpy.polynomial.hermite_e import hermevander
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
@@ -36,10 +34,8 @@ SEED = 12
 limit cuts (2.5 % rms)."""
 NORMAL_MOMENTS = (1.0, 0.0, 1.0, 0.0, 3.0, 0.0, 15.0)
 """Moments of a standard normal, by degree."""
-MAX_ITERATIONS = 30
-"""Of the Gauss-Newton steps that make the draws' moments exact."""
-MOMENT_TOLERANCE = 1e-10
-"""Largest error of a moment of the draws that ends these steps."""
+GAUSS_NEWTON_STEPS = 30
+"""Steps that make the draws' moments exact."""
 LEADING_DIRECTIONS = 3
 """Number of principal directions in which the response surface is a polynomial."""
 FIRST_AXIS_POINTS = (1.2, 3.2)
@@ -50,6 +46,7 @@ _HELD_VARIANCE_RATIO = 1e-14
 """Variance of a direction over the largest one, below which the direction counts as known exactly."""
 LEAST_K_PHI = 1e-3
 """Least share of K_L that k_phi has at a point [1]: no force shows less."""
+NO_SHIFTS = np.zeros((0, len(Soil._fields)))
 _K_C, _K_PHI, _PHI = (Soil._fields.index(name) for name in ("k_c", "k_phi", "phi"))
 
 
@@ -67,28 +64,21 @@ class SigmaPoints:
     mirror: NDArray[np.intp]
 
     @classmethod
-    def of(cls, posterior: Posterior, shifts: Array | None = None, width: float | None = None) -> SigmaPoints:
+    def of(cls, posterior: Posterior, shifts: Array = NO_SHIFTS, width: float | None = None) -> SigmaPoints:
         """Return the points of a posterior; similar posteriors have similar points in the same order.
 
-        Parameters
-        ----------
-        posterior
-            Soil and covariance of its logarithms.
-        shifts
-            (Q, 6), changes of the logarithms with one standard deviation of Q other uncertain quantities, whose outer
-            products are part of the posterior's covariance.  They are the last points.
-        width
-            Mean tyre width b [m].  Wheels of one width determine K_L, whatever its parts: where k_phi is a small part,
-            its logarithm is open, and K_L still known.  None: k_c and k_phi follow their logarithms alone.
+        shifts (Q, 6): changes of the logarithms with one sd of Q other uncertain quantities, whose outer products are
+        part of the posterior's covariance; they are the last points.  width: mean tyre width b [m], which makes K_L
+        known where k_phi is a small part of it and its logarithm open; without it k_c and k_phi follow their logarithms
+        alone.
         """
-        along = np.zeros((0, len(posterior.soil))) if shifts is None else shifts
-        variance, directions = np.linalg.eigh(posterior.log_covariance - along.T @ along)
+        variance, directions = np.linalg.eigh(posterior.log_covariance - shifts.T @ shifts)
         free = np.flatnonzero(variance > _HELD_VARIANCE_RATIO * max(variance[-1], 0.0))[::-1]
         axes = directions[:, free] * np.sqrt(variance[free])
         axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
         leading = min(len(free), LEADING_DIRECTIONS)
         points = _design(leading)
-        steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, along])
+        steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, shifts])
         soils = np.asarray(posterior.soil) * np.exp(steps)
         if width is not None:
             soils[:, [_K_C, _K_PHI]] = _moduli(posterior.soil, steps, width)
@@ -126,9 +116,6 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
     """
     change = samples[1:] - samples[0]
     known = np.isfinite(change)
-    if known.all():
-        mean = change.mean(axis=0)
-        return samples[0] + mean, np.sqrt(((change - mean) ** 2).mean(axis=0))
     count = known.sum(axis=0)
     of_count = 1.0 / np.maximum(count, 1)
     mean = np.where(known, change, 0.0).sum(axis=0) * of_count
@@ -138,10 +125,7 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
 
 
 def estimates(*samples: Array | None) -> list[Estimate | None]:
-    """Return the mean and std of scalars from their samples (1 + N,) each; None without samples or with nan.
-
-    With 256 draws, what happens on fewer than one soil in a hundred hardly enters the std.
-    """
+    """Return the mean and std of scalars from their samples (1 + N,) each; None without samples or with nan."""
     known = [each for each in samples if each is not None]
     if not known:
         return [None] * len(samples)
@@ -153,13 +137,10 @@ def estimates(*samples: Array | None) -> list[Estimate | None]:
 def likely(samples: Array | None) -> Estimate | None:
     """Return a first-order estimate of a scalar: its value at the mode and the std of its odd part.
 
-    samples (1 + N,): the value at the mode, then at pairs of a draw and its mirror image; nan where there is no value
-    (then the mirror image's is mirrored about the mode's).  None without samples.
-
-    Mean-value first-order reliability (Cornell 1969, ACI Journal 66:974).  It has no second-order term, so it gives the
-    median of a monotonic function.  The mean would not do for probabilities: poorly determined soils lie along a curved
-    valley of the likelihood, which straight principal directions leave, and the second-order term there looks like a
-    certain increase.
+    samples (1 + N,): the value at the mode, then at pairs of a draw and its mirror image; where one has none (nan), the
+    other's is mirrored about the mode's.  Mean-value first-order reliability (Cornell 1969, ACI Journal 66:974): the
+    median of a monotonic function.  A mean would not do for probabilities: along the curved valley of poorly determined
+    soils its second-order term looks like a certain increase.
     """
     if samples is None:
         return None
@@ -173,11 +154,7 @@ def likely(samples: Array | None) -> Estimate | None:
 
 @cache
 def _design(n: int) -> Array:
-    """The design points (P, n) for n independent standard normals, the origin first (Lu & Darmofal 2004).
-
-    The vertices of a regular simplex, their mirror images and the middles of its edges, all projected on one sphere;
-    then the points of the first axis, on which one vertex also lies.
-    """
+    """Points (P, n) for n standard normals: origin, simplex and edges on a sphere (Lu & Darmofal 2004), first axis."""
     if n == 0:
         return np.zeros((1, 0))
     vertices = np.zeros((n + 1, n))
@@ -196,20 +173,16 @@ def _design(n: int) -> Array:
 def normals(n: int, leading: int) -> Array:
     """Return draws (DRAWS, n) of n standard normals, each next to its mirror image; their covariance is the identity.
 
-    The leading columns have all moments of standard normals up to degree five, the first one up to seven: pseudo-random
-    draws, moved by least-norm Gauss-Newton steps until these hold.  So polynomials of them have nearly the right
-    variance.
+    Of the leading columns all moments up to degree five are those of standard normals, of the first one up to seven.
     """
     if n == 0:
         return np.zeros((DRAWS, 0))
     z = np.random.default_rng(SEED).standard_normal((DRAWS // 2, n))
     degrees = _degrees(n, leading)
     wanted = np.prod(np.array(NORMAL_MOMENTS)[degrees], axis=1)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         value, slopes = _monomials(z, degrees)
         off = value.mean(axis=1) - wanted
-        if np.abs(off).max() < MOMENT_TOLERANCE:
-            break
         by_all = slopes.reshape(len(slopes), -1) / len(z)
         z = z - (by_all.T @ np.linalg.solve(by_all @ by_all.T, off)).reshape(z.shape)
     return np.stack([z, -z], axis=1).reshape(DRAWS, n)
@@ -231,28 +204,21 @@ def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _polynomials(x: Array) -> Array:
-    """Orthonormal polynomials (P, terms) of standard normals (P, n), all up to degree two and some more.
-
-    More are those of the first column up to FIRST_AXIS_DEGREE, and its square times each other column (not with two
-    columns, where the points cannot separate that product from the other column itself).
-    """
+    """Orthonormal polynomials (P, terms) of standard normals (P, n): of degree two, and some with the first one."""
     n = x.shape[1]
     degrees = [d for d in itertools.product(range(3), repeat=n) if sum(d) <= 2]
     if n:
         degrees += [(d, *(0,) * (n - 1)) for d in range(3, FIRST_AXIS_DEGREE + 1)]
         degrees += [(2, *(int(i == k) for i in range(1, n))) for k in range(1, n) if n > 2]
-    terms = [math.prod((_hermite(column, d) for column, d in zip(x.T, of, strict=True)), start=1.0) for of in degrees]
-    return np.stack([np.broadcast_to(term, len(x)) for term in terms], axis=1)
-
-
-def _hermite(x: Array, degree: int) -> Array:
-    """Hermite polynomial with variance one under a standard normal."""
-    return np.asarray(hermeval(x, np.eye(degree + 1)[degree]) / math.sqrt(math.factorial(degree)))
+    size = np.sqrt([math.factorial(d) for d in range(FIRST_AXIS_DEGREE + 1)])
+    hermite = hermevander(x, FIRST_AXIS_DEGREE) / size  # of variance one
+    return np.stack([hermite[:, range(n), np.array(of, int)].prod(axis=1) for of in degrees], axis=1)
 
 
 def _degrees(n: int, leading: int) -> NDArray[np.intp]:
     """Degrees (Q, n) of the monomials whose mean is made exact; odd degrees are exact by symmetry."""
-    factors = [*combinations_with_replacement(range(n), 2), *combinations_with_replacement(range(leading), 4)]
+    of_all, of_leading = itertools.combinations_with_replacement(range(n), 2), range(leading)
+    factors = [*of_all, *itertools.combinations_with_replacement(of_leading, 4)]
     return np.array([np.bincount(each, minlength=n) for each in [*factors, *[(0,) * 6][:leading]]])
 
 

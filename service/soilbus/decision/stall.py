@@ -4,11 +4,10 @@
     is to stand    P(V + h dV/dt < 0) > p                     while slip grows or all motors are at their limits
     sinks          P(z + h dz/dt > z_max) > p                 z: of the deepest wheel
 
-A cause counts only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall.  A
-stall shows in both: wheels that a motor holds at their speed make slip run away; motors at their limit lose speed
-together with the vehicle.  In q a wheel that creeps, starts, or turns on a curve needs no case of its own: what the
-sensors cannot know there is in its variance (sd(V) / V)^2 + (sd(omega) / omega)^2.  Slip that grows as the draft does
-is the draft's, not the ground's.
+A cause counts only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall.
+Wheels that a motor holds at their speed make slip run away; motors at their limit lose speed together with the vehicle.
+A wheel that creeps or starts needs no case of its own: q has the variance (sd(V) / V)^2 + (sd(omega) / omega)^2.  Slip
+that grows as the draft does is the draft's, not the ground's.
 """
 
 from __future__ import annotations
@@ -20,8 +19,6 @@ from soilbus.config.model import Traversability
 from soilbus.config.model import Warning as Settings
 from soilbus.decision.moments import Sample
 from soilbus.decision.options import WATCH, WatchOptions
-
-__all__ = ["LONGEST_GAP", "LocalTrend", "Stall", "smoothed", "stalling"]
 
 LONGEST_GAP = 1.0
 """Silence [s] after which the trends start afresh."""
@@ -43,14 +40,7 @@ class LocalTrend(NamedTuple):
     def after(self, step: float, value: float, variance: float, wander: float) -> LocalTrend:
         """Return the trend after one more sample.
 
-        Parameters
-        ----------
-        step
-            [s], since the last call.
-        value, variance
-            The sample; nan where not known.
-        wander
-            [1/s per sqrt(s)], intensity of the random walk of the rate.
+        step [s]: since the last call.  value, variance: nan where not known.  wander [1/s per sqrt(s)]: of the rate.
         """
         known = math.isfinite(value) and math.isfinite(variance)
         if math.isinf(self.var):
@@ -132,18 +122,8 @@ def stalling(
 ) -> Stall:  # fmt: skip
     """Return the signs of a stall after one more sample; samples in their order, at any rate.
 
-    Parameters
-    ----------
-    before
-        After the sample before; the trends start afresh after LONGEST_GAP or when time goes back.
-    sample
-        The wheels and the vehicle now; one of the time of the last is the same bin, seen again.
-    min_speed
-        [m/s], speeds of wheels and vehicle below which there is no slip.
-    settings, limits
-        Horizons, probability, noise; `max_slip` and `max_sinkage`.
-    options
-        Tuning values.
+    The trends start afresh after LONGEST_GAP or when time goes back.  sample: one of the time of the last is the same
+    bin, seen again.  min_speed [m/s]: of wheels and vehicle, below which there is no slip.
     """
     step = sample.t - before.t
     if step == 0.0:

@@ -1,19 +1,15 @@
 """Saturation: the greatest torque that a motor gives, from its torque alone, independent of any reported limit.
 
-Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked of the vehicle; at the ceiling it does
-not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
+Torque T of a wheel below its motor's ceiling follows the pull Q that is asked of the vehicle; at the ceiling it does
+not.  Over one span of bins, with means T', Q' and mean load N':
 
     follows      T - b (Q - Q') - T' (N / N' - 1) has no trend     b = T' / sum(T' / r): its share of the thrust
     saturated    T - T' is noise without trend, and T does not follow      a trend: a slope beyond its residuals
 
-What shakes the vehicle has no trend, however little its sensors say of their noise.
-A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
-it down is not asked of the motors: a vehicle that loses speed under a draft that rises while its torques stand has an
-unmet demand.  A ceiling is never exceeded, so only the highest torque measured so far can be one.
-
-A constant command below the ceiling, a pedal that is held, looks the same while it lasts.  So one plateau counts while
-the vehicle loses speed on it; a second one at the same level, with less torque between them, makes it a ceiling until
-the torque exceeds it.
+A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up.  A ceiling
+is never exceeded, so only the highest torque so far can be one.  A command held below it looks the same while it lasts:
+one plateau counts while the vehicle loses speed on it; a second one at the same level, with less torque between them,
+makes it a ceiling until the torque exceeds it.
 """
 
 from __future__ import annotations
@@ -116,10 +112,7 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
 
 
 def _trend(since: Array, values: Array, variance: Array | float = 0.0) -> Array:
-    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959).
-
-    The residuals have at least this variance.
-    """
+    """Slope of columns (N, W) over time (N, 1) as normal deviate (Wallace 1959), of residuals with this variance."""
     values, free = values - values.mean(axis=0), len(values) - 2
     spread = float((since**2).sum())
     slope = (since * values).sum(axis=0) / spread

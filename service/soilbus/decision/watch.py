@@ -1,10 +1,9 @@
 """The watch for immobilisation: one state machine, ten times a second, that says what it sees and warns.
 
     spins          v_s > max(v_min, s_max r omega)                   a wheel; no loss while others grip with torque left
-    stalls         V < v_min, no wheel turns, and thrust exceeds what draft, slope and inertia ask, or all motors are
-                   at their limits
-    is to stand    slip runs away, speed or depth leads to its limit                            `stall`, needs no soil
-    weakens        the curve of pull over slip and what is measured leave ever less, or too little           `margin`
+    stalls         V < v_min, no wheel turns, and thrust exceeds the pull, or all motors are at their limits
+    `stall`        slip runs away, speed or depth leads to its limit: needs no soil
+    `margin`       the curve of pull over slip and what is measured leave ever less, or too little
 
 Without a ground speed `stall` reckons one from acceleration and wheels, dV/dt = a + (r omega - V) / tau: it warns, but
 clears nothing.  Spinning or stalling for `spin_time` overrules a go of the estimate; without any way for `stuck_time`
@@ -28,8 +27,6 @@ from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
 
-__all__ = ["Alert", "Warnings", "Watch", "curve_age", "ended", "seen_at", "watched"]
-
 
 class Alert(StrEnum):
     """Warning of immobilisation."""
@@ -42,30 +39,15 @@ class Alert(StrEnum):
 class Watch(NamedTuple):
     """State of the watch; `watched` makes the next one.  All times in s.
 
-    Attributes
-    ----------
-    t
-        The last moment.
-    spins, sticks, moves
-        Since when a wheel spins or the vehicle stalls; it does not move under thrust; it moves without spinning.  inf
-        where it does not.
-    spinning, slides, stuck
-        Spinning or stalling has lasted for `spin_time`; so has spinning of half of the wheels or without any way; the
-        vehicle is stuck and has not moved since.
-    last
-        The last moment that was spinning or stuck: older data do not describe the ground under the wheels.
-    slip, pull
-        Slip, and pull [N], low-pass filtered with the time constant `spin_time`; nan where not known.
-    engaged
-        Which wheels drive.
-    reckoned, measured
-        Ground speed [m/s], from acceleration and wheels where it is not measured; when it was measured last.
-    stall, margin, caused
-        What slip and speed say; what the curve leaves, and when it last gave a cause.
-    warning, cause, time_left
-        The output: the warning, what is seen, and the time that is left, None where it is not known.
-    is_caused
-        Whether the warning has a cause no older than `warning.hold`; else it only lasts, until a decision is go.
+    t: the last moment.  spins, sticks, moves: since when a wheel spins or the vehicle stalls, it does not move under
+    thrust, it moves without spinning; inf where it does not.  spinning, slides, stuck: spinning or stalling has lasted
+    for `spin_time`, so has spinning of half of the wheels or without any way, the vehicle is stuck and has not moved
+    since.  last: the last moment that was spinning or stuck; older data do not describe the ground under the wheels.
+    slip, pull [N]: low-pass filtered with `spin_time`, nan where not known.  engaged: which wheels drive.  reckoned,
+    measured: ground speed [m/s], from acceleration and wheels where it is not measured, and when it was measured last.
+    stall, margin, caused: what slip and speed say, what the curve leaves, and when it last gave a cause.  warning,
+    cause, time_left: the output, what is seen, and the time that is left, None where it is not known.  is_caused:
+    whether the warning has a cause no older than `warning.hold`; else it only lasts, until a decision is go.
     """
 
     t: float = -math.inf
@@ -95,18 +77,9 @@ def watched(
 ) -> Watch:
     """Return the watch after one more moment; moments in their order, at any rate.
 
-    Parameters
-    ----------
-    before
-        The watch after the moment before; its trends start afresh after LONGEST_GAP, or when time goes back.
-    moment
-        The wheels and the vehicle now.
-    curve
-        Pull over slip of the last window that had one.
-    config
-        `min_speed` [m/s], above which the vehicle moves; limits and times of `traversability` and `warning`.
-    options
-        Tuning values.
+    The trends start afresh after LONGEST_GAP, or when time goes back.  curve: pull over slip of the last window that
+    had one.  config: `min_speed` [m/s], above which the vehicle moves; limits and times of `traversability` and
+    `warning`.
     """
     now = _stalled(_moved(before, moment, config), before, moment, config, options)
     margin = before.margin if moment.engaged == before.engaged else Margin()  # another drive has another curve

@@ -30,8 +30,7 @@ from soilbus.terra.wheel import MAX_ENTRY_ANGLE, WheelModel, WheelState
 NEWTON_TOLERANCE = 1e-3
 """Step of pull and load, as a share of the weight, below which Newton's method stops; it leaves some 1e-6."""
 RELATIVE_REGULARISATION = 1e-6
-"""Ridge term of the regression on the soils' logarithms, as a share of their total sum of squares: directions with a
-smaller spread do not determine how pull and angles change."""
+"""Ridge term of the regression on the soils' logarithms, as a share of their total sum of squares."""
 LEAST_POSITIVE = 1e-12
 """Lower bound of a soil parameter before its logarithm is taken, and of the ridge term."""
 MAX_NEWTON_STEPS = 12
@@ -65,11 +64,6 @@ class Axles:
     of_wheel: NDArray[np.intp]
     shared_motors: tuple[Group, ...] = ()
     length: Array | float = 0.0
-
-    @property
-    def drives(self) -> NDArray[np.bool_]:
-        """Which wheels are driven (W,)."""
-        return np.asarray(self.driven[self.of_wheel, 0])
 
     @classmethod
     def of(cls, rig: Rig, drives: NDArray[np.bool_]) -> Axles:
@@ -113,19 +107,11 @@ class Axles:
 class WheelTable:
     """Steady states on the level of D soils, A kinds of wheels, S slips.
 
-    Attributes
-    ----------
-    axles, soils, slip
-        The kinds of wheels, soils (D, 6), and slips (S,) of the driven wheels.
-    pull, load
-        (D, S) [N] of the vehicle, nan where not balanced; (D, A, S) [N] of one wheel.
-    at, by_load, by_slip
-        (3, D, A, S), drawbar pull [N], torque [N m] and entry angle [rad] of one wheel, and their derivatives by its
-        load at constant slip and by slip at constant load.
-    half_second_derivative
-        (3, 1, A, S), half the second derivative of `at` by load, of the first soil and used for all.
-    balanced
-        (D, S), whether a steady state was found.
+    soils (D, 6).  slip (S,): of the driven wheels.  pull (D, S) [N]: of the vehicle, nan where not balanced.  load (D,
+    A, S) [N]: of one wheel.  at, by_load, by_slip (3, D, A, S): drawbar pull [N], torque [N m] and entry angle [rad] of
+    one wheel, and their derivatives by its load at constant slip and by slip at constant load.  half_second_derivative
+    (3, 1, A, S): half of that of `at` by load, of the first soil and used for all.  balanced (D, S): whether a steady
+    state was found.
     """
 
     axles: Axles
@@ -156,20 +142,9 @@ def wheel_table(
 ) -> WheelTable:
     """Return the steady level driving on D soils (D, 6) at S slips (S,) of the driven wheels.
 
-    Parameters
-    ----------
-    soils
-        The last of them belong to the perturbed models of an uncertain model.
-    rig
-        With a chassis, else ValueError.
-    model, slip
-        The wheel-soil model; slips.
-    start
-        Table of the same rig on similar soils, to start Newton's method from.
-    tolerance
-        Step of pull and load, as a share of the weight, below which Newton's method stops.
-    driven
-        (W,), which wheels are driven; None for all.
+    The last soils belong to the perturbed models of an uncertain model.  rig: with a chassis, else ValueError.  start:
+    table of the same rig on similar soils.  tolerance: step of pull and load, as a share of the weight, below which
+    Newton's method stops.  driven (W,): which wheels are driven; None for all.
     """
     n_soils, n_slips = len(soils), len(slip)
     completed = UncertainModel.over(model).of_rows(n_soils)
@@ -177,11 +152,10 @@ def wheel_table(
     if start is not None and not (
         start.pull.shape == (n_soils, n_slips)
         and np.array_equal(start.slip, slip)
-        and np.array_equal(start.axles.drives, drives)
+        and np.array_equal(start.axles.driven[start.axles.of_wheel, 0], drives)
     ):
         start = None
-    is_same = start is not None and start.axles.chassis == rig.chassis
-    axles = start.axles if start is not None and is_same else Axles.of(rig, drives)
+    axles = start.axles if start is not None and start.axles.chassis == rig.chassis else Axles.of(rig, drives)
     options = rig.options.measurements
     # a track without thrust does not slip
     rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, options.rolling_slip)
@@ -196,7 +170,7 @@ def wheel_table(
     unknown = np.isnan(angle).any(axis=(1, 2))
     if unknown.any():
         guess = _state(soils[unknown], axles, slips[unknown], angle[unknown])
-        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.first.model, tolerance=1e-2)
+        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.models[0].model, tolerance=1e-2)
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
         now = _newton_step(soils, axles, completed, slips, pull, load, angle, options.max_rolling_skid)
@@ -214,7 +188,7 @@ def wheel_table(
     pull, load, at, by_load, by_slip, slips, step_size = now
     balanced = np.isfinite(at[ANGLE]).all(axis=1) & (load > 0.0).all(axis=1) & (step_size <= last_step)
     half_second = _half_second_derivative(
-        soils[:1], axles, completed.first, slips[:1], load[:1], at[:, :1], by_load[:, :1]
+        soils[:1], axles, completed.models[0], slips[:1], load[:1], at[:, :1], by_load[:, :1]
     )
     pull = np.where(balanced, pull, np.nan)
     return WheelTable(axles, soils, slip, pull, load, at, by_load, by_slip, half_second, balanced)
