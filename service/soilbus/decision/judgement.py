@@ -41,9 +41,18 @@ def judge(
 ) -> tuple[Traversability, WheelTable | None]:
     """Return whether the vehicle can go on, on the ground of one window, and the table to start the next one from.
 
-    posterior, status: of the window's soil, None where there is no estimate.  demand: draft and slope, None where not
-    known; only a valid status and a known demand can give go.  torque_limit (W,) [N m]: nan where not known.  settings:
-    limits of slip and sinkage, margin, thresholds.  last: the table of the window before, to start from.
+    Parameters
+    ----------
+    posterior, status
+        Of the window's soil; None where there is no estimate.
+    demand
+        Draft and slope, None where not known; only a valid status and a known demand can give go.
+    torque_limit
+        (W,) [N m], nan where not known.
+    settings
+        Limits of slip and sinkage, margin, thresholds.
+    last
+        The table of the window before, to start from.
     """
     available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
     if posterior is None or status is Status.INVALID or rig.chassis is None:

@@ -74,14 +74,16 @@ class TorqueCeiling:
         if len(window.t) < LEAST_BINS:
             return self
         torque, var = window.torque.mean(axis=0), window.variance["torque"].mean(axis=0) / len(window.t)
-        with np.errstate(invalid="ignore"):
+        since = window.t - window.t.mean()
+        with np.errstate(invalid="ignore"):  # a speed or torque that is no number
+            gain = float(since @ window.ground_speed)  # of the ground speed's regression on time
             noise = deviations * np.sqrt(2.0 * var)
             exceeded, below = torque - self.level > noise, self.level - torque > noise
             saturated = _saturated(window, rig, deviations) & (self.highest - torque <= noise)
         known = np.isfinite(self.level) & ~exceeded
         same = saturated & known & ~below
         level = np.where(saturated, torque, np.where(known, self.level, np.nan))
-        gain, of_noise = _speed_gained(window, deviations)
+        of_noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
         lasts = saturated | (self.lasts & known & ~below)
         return replace(
             self,
@@ -119,11 +121,3 @@ def _trend(since: Array, values: Array, variance: Array | float = 0.0) -> Array:
     rest = np.maximum(((values - slope * since) ** 2).sum(axis=0) / free, variance)
     share = (8.0 * free + 1.0) / (8.0 * free + 3.0)
     return np.asarray(share * np.sqrt(free * np.log1p(slope**2 * spread / rest / free)))
-
-
-def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
-    """Ground speed gained over the window (regression on time), and its significance limit; both in m/s * s."""
-    since = window.t - window.t.mean()
-    noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
-    with np.errstate(invalid="ignore"):  # a ground speed that is no number
-        return float(since @ window.ground_speed), noise

@@ -197,10 +197,7 @@ def _reckoned(before: Watch, moment: Moment, sample: Sample, options: WatchOptio
 
 
 def _others_grip(moment: Moment, spins: Sequence[bool]) -> bool:
-    """Whether the wheels that do not spin grip with torque left: more than an open differential could hand them.
-
-    mean torque of wheels that grip > (0.5 + b) / (0.5 - b) times that of wheels that spin
-    """
+    """Whether wheels grip with torque left, at more than (0.5 + b) / (0.5 - b) times the torque of those that spin."""
     wheels = list(zip(moment.torque, spins, moment.reserve, strict=False))
     spinning = [torque for torque, spin, _ in wheels if spin and math.isfinite(torque)]
     gripping = [torque for torque, spin, below in wheels if below and not spin]

@@ -140,11 +140,11 @@ def wheel_table(
     tolerance: float = NEWTON_TOLERANCE,
     driven: NDArray[np.bool_] | None = None,
 ) -> WheelTable:
-    """Return the steady level driving on D soils (D, 6) at S slips (S,) of the driven wheels.
+    """Return the steady level driving on D soils at S slips.
 
-    The last soils belong to the perturbed models of an uncertain model.  rig: with a chassis, else ValueError.  start:
-    table of the same rig on similar soils.  tolerance: step of pull and load, as a share of the weight, below which
-    Newton's method stops.  driven (W,): which wheels are driven; None for all.
+    soils (D, 6): the last belong to the perturbed models of an uncertain model.  slip (S,): of the driven wheels.  rig:
+    with a chassis, else ValueError.  start: table of the same rig on similar soils.  tolerance: step of pull and load,
+    as a share of the weight, below which Newton's method stops.  driven (W,): which wheels are driven; None for all.
     """
     n_soils, n_slips = len(soils), len(slip)
     completed = UncertainModel.over(model).of_rows(n_soils)
@@ -179,10 +179,8 @@ def wheel_table(
             if not len(rows):
                 break
             angle[rows] = np.clip(now.at[ANGLE, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
-            step = _newton_step(
-                soils[rows], axles, completed.of(rows), now.slip[rows], now.pull[rows], now.load[rows], angle[rows],
-                options.max_rolling_skid,
-            )  # fmt: skip
+            at_rows = now.slip[rows], now.pull[rows], now.load[rows], angle[rows]
+            step = _newton_step(soils[rows], axles, completed.of(rows), *at_rows, options.max_rolling_skid)
             for whole, part in zip(now, step, strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
     pull, load, at, by_load, by_slip, slips, step_size = now
