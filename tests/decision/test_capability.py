@@ -320,7 +320,7 @@ def test_wheels_of_one_width_know_their_modulus_whatever_its_parts():
     by_K_L = 0.03 * np.array([1.0, 1.0])
     covariance = np.zeros((6, 6))
     covariance[:2, :2] = np.outer(by_k_c, by_k_c) + np.outer(by_K_L, by_K_L)
-    points = SigmaPoints.of(Posterior(soil, covariance), None, width)
+    points = SigmaPoints.of(Posterior(soil, covariance), width=width)
     K_L = points.soils[:, 0] / width + points.soils[:, 1]
     assert (points.soils[:, :2] > 0.0).all()
     mean, std = mean_and_std(points.drawn(np.log(K_L)))

@@ -13,8 +13,7 @@ import pytest
 
 from soilbus.config.model import Traversability, Warning
 from soilbus.decision.moments import Sample
-from soilbus.decision.trends import LocalTrend
-from soilbus.decision.watch import Stall, stalling
+from soilbus.decision.stall import LocalTrend, Stall, stalling
 
 G, STEP, LOOK = 9.81, 0.0005, 0.1
 

@@ -34,9 +34,8 @@ from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.options import WATCH
 from soilbus.decision.traversability import State, Status, Traversability
-from soilbus.decision.watch import Alert, Watch, ended, seen_at, watched
+from soilbus.decision.watch import Alert, Watch, curve_age, ended, seen_at, watched
 from soilbus.pipeline.corrections import NO_CORRECTIONS
 from soilbus.pipeline.intake import Latest, input_rejected
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
@@ -404,7 +403,7 @@ class Service:
     def _present_curve(self, now: float) -> OverSlip | None:
         """Pull over slip of the last window that had one, while it is young enough to extrapolate from."""
         known, t = self._curve
-        return known if self._time.at(now) - t < WATCH.curve_age else None
+        return known if self._time.at(now) - t < curve_age(self.config) else None
 
     def _age(self, now: float) -> float:
         """Of the data that the decision rests on [s]."""

@@ -11,7 +11,7 @@ by cubic Hermite interpolation.  Everything is computed for all soils of a poste
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple
@@ -25,23 +25,6 @@ from soilbus.decision.uncertain_model import ModelOfRows
 from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
-__all__ = [
-    "LEVEL",
-    "Balance",
-    "BetweenSlips",
-    "Columns",
-    "Duty",
-    "Largest",
-    "Limits",
-    "axle_sum",
-    "balance",
-    "climbing",
-    "largest_pull",
-    "point_of_pull",
-    "slips_of_most",
-    "within",
-]
-
 SUBDIVISIONS = 5
 """Parts into which each step of the slip grid is divided."""
 NEWTON_STEPS = 3
@@ -53,7 +36,7 @@ Cause = Literal["torque", "traction", "sinkage", "slip"]
 class Duty(NamedTuple):
     """Use of the pull: a draft [N] and a slope (its sine); the one that is None takes the rest."""
 
-    draft: Any = None
+    draft: float | None = None
     sine: float | None = 0.0
 
     def split(self, pull: Any, weight: float) -> tuple[Any, Any]:
@@ -66,64 +49,41 @@ class Duty(NamedTuple):
 LEVEL = Duty()
 
 
-class Columns(NamedTuple):
-    """Places of a balance's columns: the vehicle's pull, then three quantities for each kind of wheel."""
-
-    pull: int
-    drawbar: slice
-    torque: slice
-    angle: slice
-
-    @staticmethod
-    @cache
-    def of(kinds: int) -> Columns:
-        """Return the columns for this number of kinds of wheels."""
-        return Columns(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
-
-
 @dataclass(frozen=True)
 class Balance:
     """The steady states of D soils at F slips, for A kinds of wheels.
 
-    Attributes
-    ----------
-    slip
-        (F,).
-    known
-        (D, F), where a steady state exists.
-    columns
-        (D, 1 + 3 A, F): pull of the vehicle [N], then drawbar pull [N], torque [N m] and entry angle [rad] of one wheel
-        of each kind.  Read them by the properties.
+    slip (F,).  known (D, F): where a steady state exists.  columns (D, 1 + 3 A, F): pull of the vehicle [N], then
+    drawbar pull [N], torque [N m] and entry angle [rad] of one wheel of each kind; the properties read them.
     """
 
     slip: Array
     known: NDArray[np.bool_]
     columns: Array
 
-    @cached_property
-    def at(self) -> Columns:
-        """Places of the columns."""
-        return Columns.of(self.columns.shape[1] // 3)
+    def _of_kinds(self, place: int) -> Array:
+        kinds = self.columns.shape[1] // 3
+        return self.columns[:, 1 + place * kinds : 1 + (place + 1) * kinds]
 
     @cached_property
     def pull(self) -> Array:
         """Pull of the vehicle [N] (D, F)."""
-        return self.columns[:, self.at.pull]
+        return self.columns[:, 0]
 
     @cached_property
     def drawbar(self) -> Array:
         """Drawbar pull of one wheel [N] (D, A, F)."""
-        return self.columns[:, self.at.drawbar]
+        return self._of_kinds(0)
 
     @cached_property
     def torque(self) -> Array:
         """Torque of one wheel [N m] (D, A, F)."""
-        return self.columns[:, self.at.torque]
+        return self._of_kinds(1)
 
     @cached_property
     def angle(self) -> Array:
         """Entry angle [rad] (D, A, F)."""
-        return self.columns[:, self.at.angle]
+        return self._of_kinds(2)
 
     def drawn(self, points: SigmaPoints) -> Balance:
         """Return the balance of a posterior's mode and draws (1 + N instead of D), from that of its sigma points."""
@@ -146,18 +106,10 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: ModelOfRows) -> Limits:
-        """Return the limits of each kind of wheel.
+        """Return the limits of each kind of wheel on the soils of a model.
 
-        Parameters
-        ----------
-        axles
-            The kinds of wheels.
-        torque_limit
-            (W,) [N m], nan where not known.
-        max_sinkage
-            [m], converted to an entry angle at the wheels' loads on the level.
-        model
-            The wheel-soil models of the D soils.
+        torque_limit: (W,) [N m], nan where not known; max_sinkage [m], converted to an entry angle at the wheels' loads
+        on the level.
         """
         A = len(axles.count)
         torque, motors = np.full(A, np.inf), np.eye(A)
@@ -172,9 +124,22 @@ class Limits(NamedTuple):
         deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]))
         return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE), motors)
 
-    def of_motors(self, torque: Array) -> Array:
-        """Return the torques of the motors (D, G, ...) from those of one wheel of each kind (D, A, ...)."""
-        return torque if len(self.motors) == self.motors.shape[1] else np.einsum("ga,da...->dg...", self.motors, torque)
+    def all(self) -> Array:
+        """Return the limits (D, G + A) of what `used` returns."""
+        return np.concatenate(
+            [np.broadcast_to(self.torque, (*self.angle.shape[:-1], len(self.torque))), self.angle], axis=-1
+        )
+
+    def used(self, balance: Balance) -> Array:
+        """Return the torques by motor and entry angles by kind (D, G + A, F) of steady states."""
+        torque = balance.torque
+        if len(self.motors) > torque.shape[1]:
+            torque = np.einsum("ga,da...->dg...", self.motors, torque)
+        return np.concatenate([torque, balance.angle], axis=1)
+
+    def allow(self, balance: Balance) -> NDArray[np.bool_]:
+        """Return which steady states (D, F) are within the limits."""
+        return np.asarray(balance.known & (self.used(balance) <= self.all()[..., None]).all(axis=1))
 
 
 class Largest(NamedTuple):
@@ -185,84 +150,49 @@ class Largest(NamedTuple):
     cause: Cause
 
 
-class BetweenSlips(NamedTuple):
-    """A point between two slips of a balance, for each soil (D,).
-
-    before: index of the slip before it; share: of the step to the next slip, nan where there is no such point.
-    """
-
-    before: NDArray[np.intp]
-    share: Array
-
-    def on(self, values: Array) -> Array:
-        """Return values (D, ..., F) interpolated linearly at the point: (D, ...)."""
-        row = np.arange(len(values))
-        here, there = values[row, ..., self.before], values[row, ..., self.before + 1]
-        share = self.share.reshape(-1, *(1,) * (here.ndim - 1))
-        return np.asarray(here + share * (there - here))
-
-
 def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None) -> Balance:
     """Return the steady states under a duty, on a slip grid SUBDIVISIONS times as fine as the table's.
 
-    Parameters
-    ----------
-    table
-        Wheels at the loads of the steady level pull.
-    duty
-        Draft and slope.
-    level
-        The table's balance on the level, where it is already computed.
-
-    Notes
-    -----
-    Cubic Hermite interpolation between the table's slips, with the table's derivatives by slip.
+    level: the table's balance on the level, where it is already computed.
     """
     slip, cell, of_values, of_slopes, of_changes = _refinement(tuple(table.slip.tolist()))
+    axles, weight, balanced = table.axles, table.axles.weight, table.balanced
     if level is None:
-        columns = _interpolated(_columns(table.pull, table.at), of_values) + _interpolated(
-            _derivatives_by_slip(table), of_slopes
-        )
-        level = Balance(slip, _between(table.balanced, cell), columns)
+        loss = 1.0 - (axles.count * table.by_load[DRAWBAR] * axles.lever).sum(axis=1)
+        pull_by_slip = (axles.count * table.by_slip[DRAWBAR]).sum(axis=1) / loss
+        by_slip = table.by_slip + table.by_load * (axles.lever * pull_by_slip[:, None])
+        columns = _columns(table.pull, table.at) @ of_values + _columns(pull_by_slip, by_slip) @ of_slopes
+        level = Balance(slip, (balanced[:, :-1] & balanced[:, 1:])[:, cell], columns)
     if duty == LEVEL:
         return level
-    change, balanced = _change_under(table, duty)
-    return Balance(slip, _between(balanced, cell), level.columns + _interpolated(change, of_changes))
-
-
-def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list[Balance]:
-    """Return the `balance` with each of the drafts [N] and the slope that uses the rest of the pull."""
-    slip, cell, _, _, of_changes = _refinement(tuple(table.slip.tolist()))
-    changes, balanced = _change_under(table, Duty(np.array(drafts)[:, None, None], None))
-    columns = level.columns + _interpolated(changes, of_changes)
-    return [Balance(slip, _between(known, cell), of) for known, of in zip(balanced, columns, strict=True)]
+    start = pull = np.where(balanced, table.pull, 0.0)
+    by_pull = axles.lever if duty.draft is None else axles.tilt / weight
+    slope = (axles.count * table.by_load[DRAWBAR] * by_pull).sum(axis=1) - 1.0
+    for _ in range(NEWTON_STEPS):
+        load = axles.loads(*duty.split(pull, weight))
+        change = table.change_at(load)
+        pull = pull - ((axles.count * (table.at[DRAWBAR] + change[DRAWBAR])).sum(axis=1) - pull) / slope
+    _, sine = duty.split(pull, weight)
+    balanced = balanced & (load > 0.0).all(axis=1) & (np.abs(sine) < MAX_SINE)
+    changes = np.where(balanced[:, None], _columns(pull - start, change), 0.0)
+    return Balance(slip, (balanced[:, :-1] & balanced[:, 1:])[:, cell], level.columns + changes @ of_changes)
 
 
 def largest_pull(balance: Balance, limits: Limits) -> Largest:
     """Return the largest pull over slip within the limits.
 
-    Parameters
-    ----------
-    balance
-        Steady states of D soils.
-    limits
-        Of torque and entry angle.
-
-    Returns
-    -------
-    Largest
-        Linearly interpolated to where a limit is met; its cause is that of the first soil.
+    It is interpolated linearly to where a limit is met; its cause is that of the first soil.
     """
-    usable = within(balance, limits)
+    used, limit = limits.used(balance), limits.all()
+    usable = balance.known & (used <= limit[..., None]).all(axis=1)
     row, last = np.arange(len(usable)), usable.shape[1] - 1
     best = np.where(usable, balance.pull, -np.inf).argmax(axis=1)
     after = np.minimum(best + 1, last)
-    here, there = balance.columns[row, :, best], balance.columns[row, :, after]
-    at, n_motors = balance.at, len(limits.torque)
-    pull, next_pull, slip = here[:, at.pull], there[:, at.pull], balance.slip[best]
+    pull, next_pull, slip = balance.pull[row, best], balance.pull[row, after], balance.slip[best]
     more = balance.known[row, after] & (next_pull > pull)
-    ends = [np.concatenate([limits.of_motors(end[:, at.torque]), end[:, at.angle]], axis=1) for end in (here, there)]
-    by_limit = _shares_to_limits(ends[0], ends[1], limits)
+    here, there = used[row, :, best], used[row, :, after]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_limit = np.where(there > limit, (limit - here) / (there - here), 1.0)
     share = np.where(more, by_limit.min(axis=1), 0.0)
     pull = pull + share * (next_pull - pull)
     slip = slip + share * (balance.slip[after] - slip)
@@ -271,54 +201,38 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     if best[0] == last:
         cause = "slip"
     elif more[0]:
-        cause = "torque" if by_limit[0, :n_motors].min() <= by_limit[0, n_motors:].min() else "sinkage"
+        cause = "torque" if by_limit[0].argmin() < len(limits.torque) else "sinkage"
     return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
 
 
-def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
-    """Return which steady states (D, F) are within the limits."""
-    usable = balance.known.copy()
-    of_motors = limits.of_motors(balance.torque)
-    for motor, torque in enumerate(limits.torque):
-        usable &= of_motors[:, motor] <= torque
-    for kind in range(balance.angle.shape[1]):
-        usable &= balance.angle[:, kind] <= limits.angle[..., kind, None]
-    return usable
+def at_pull(balance: Balance, pull: float) -> Callable[[Array], Array]:
+    """Return a function that interpolates values (D, ..., F) to the least slip at which each soil gives a pull [N].
 
-
-def point_of_pull(balance: Balance, pull: float) -> BetweenSlips:
-    """Return the least slip at which each soil gives this pull [N]: the first slip if it gives more, else none."""
+    That is the first slip where it gives more; where none does, the values are nan.
+    """
     enough = balance.known & (balance.pull >= pull)
-    first = enough.argmax(axis=1)
-    before = np.maximum(first - 1, 0)
-    row = np.arange(len(first))
+    row, before = np.arange(len(enough)), np.maximum(enough.argmax(axis=1) - 1, 0)
     low, high = balance.pull[row, before], balance.pull[row, before + 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.clip((pull - low) / (high - low), 0.0, 1.0)
     share = np.where(balance.known[row, before], share, 1.0)
-    return BetweenSlips(before, np.where(enough.any(axis=1), share, np.nan))
+    share = np.where(enough.any(axis=1), share, np.nan)
+
+    def on(values: Array) -> Array:
+        here, there = values[row, ..., before], values[row, ..., before + 1]
+        return np.asarray(here + share.reshape(-1, *(1,) * (here.ndim - 1)) * (there - here))
+
+    return on
 
 
 def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -> Array:
-    """Return the slips at which quantities are largest within the limits.
+    """Return the slips (Q, D) at which Q quantities over slip (Q, D, F) are largest within the limits.
 
-    Parameters
-    ----------
-    values
-        (Q, D, F), Q quantities over slip.
-    balance, limits
-        Steady states of D soils, and what is allowed.
-    top
-        (D,), slip at which the limits end.
-
-    Returns
-    -------
-    Array
-        (Q, D), at the vertex of the parabola through the largest value and its neighbours; nan where no value within
-        the limits is above zero.
+    They are the vertices of parabolas through the largest values and their neighbours, up to the slip `top` (D,) at
+    which the limits end; nan where no value within the limits is above zero.
     """
     slip, last = balance.slip, len(balance.slip) - 1
-    usable = within(balance, limits) & (values > 0.0)
+    usable = limits.allow(balance) & (values > 0.0)
     best = (values * usable).argmax(axis=-1)
     after = np.minimum(best + 1, last)
     quantity, row = np.ogrid[: len(values), : values.shape[1]]
@@ -335,83 +249,21 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
     return np.where(usable[quantity, row, best], np.where(inside, vertex, at_end), np.nan)
 
 
-def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
-    """Return the sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), times a factor (A, 1)."""
-    share = (axles.count * each)[:, 0]
-    return np.asarray(np.einsum("a,daf->df", share[kinds], values[:, kinds]))
-
-
-def _columns(pull: Array, at: Iterable[Array]) -> Array:
-    """Pull (..., D, S), then pulls, torques and entry angles by kind, each (..., D, A, S): (..., D, 1 + 3 A, S)."""
-    return np.concatenate([pull[..., None, :], *at], axis=-2)
-
-
-def _derivatives_by_slip(table: WheelTable) -> Array:
-    """Derivatives by slip of the columns of the level table, with the loads following."""
-    axles = table.axles
-    loss = 1.0 - (axles.count * table.by_load[DRAWBAR] * axles.lever).sum(axis=1)
-    pull_by_slip = (axles.count * table.by_slip[DRAWBAR]).sum(axis=1) / loss
-    by_slip = table.by_slip + table.by_load * (axles.lever * pull_by_slip[:, None])
-    return _columns(pull_by_slip, by_slip)
-
-
-def _change_under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool_]]:
-    """Change of the table's columns under another duty, and where there is a steady state (D, S).
-
-    With several drafts (Q, 1, 1) both results have a leading axis Q.
-    """
-    axles, weight = table.axles, table.axles.weight
-    level = pull = np.where(table.balanced, table.pull, 0.0)
-    by_pull = axles.lever if duty.draft is None else axles.tilt / weight
-    slope = (axles.count * table.by_load[DRAWBAR] * by_pull).sum(axis=1) - 1.0
-    for _ in range(NEWTON_STEPS):
-        load = axles.loads(*duty.split(pull, weight))
-        pull = pull - (table.pull_at(load) - pull) / slope
-    _, sine = duty.split(pull, weight)
-    balanced = table.balanced & (load > 0.0).all(axis=-2) & (np.abs(sine) < MAX_SINE)
-    change = _columns(pull - level, table.change_at(load))
-    return np.where(balanced[..., None, :], change, np.nan), balanced
+def _columns(pull: Array, at: Array) -> Array:
+    """Pull (D, S), then pulls, torques and entry angles by kind (3, D, A, S): (D, 1 + 3 A, S), 0 where not known."""
+    columns = np.concatenate([pull[:, None], *at], axis=1)
+    return np.where(np.isfinite(columns), columns, 0.0)
 
 
 @cache
 def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
-    """The fine grid, and the matrices of cubic Hermite interpolation onto it.
-
-    Returns the fine slips (F,), the step of the coarse grid in which each lies (F,), and matrices (S, F): of values, of
-    slopes, and of values whose slopes are second-order differences.
-    """
+    """Fine slips (F,), the step of each, and matrices (S, F) that interpolate by values, by slopes, by values alone."""
     slip = np.array(slips)
-    step, part = np.divmod(np.arange(SUBDIVISIONS * (len(slip) - 1) + 1), SUBDIVISIONS)
-    part = np.where(step == len(slip) - 1, SUBDIVISIONS, part) / SUBDIVISIONS
-    cell = np.minimum(step, len(slip) - 2)
-    width = np.diff(slip)[cell]
-    of_values, of_slopes = np.zeros((2, len(slip), len(cell)))
-    column = np.arange(len(cell))
-    of_values[cell, column] = (1.0 + 2.0 * part) * (1.0 - part) ** 2
-    of_values[cell + 1, column] = part**2 * (3.0 - 2.0 * part)
-    of_slopes[cell, column] = width * part * (1.0 - part) ** 2
-    of_slopes[cell + 1, column] = width * part**2 * (part - 1.0)
-    differences = np.gradient(np.eye(len(slip)), slip, axis=1)
+    place = np.arange(SUBDIVISIONS * (len(slip) - 1) + 1) / SUBDIVISIONS
+    cell = np.minimum(place.astype(int), len(slip) - 2)
+    part, width, unit = place - cell, np.diff(slip)[cell], np.eye(len(slip))
+    here, there = unit[:, cell], unit[:, cell + 1]
+    of_values = here * (1.0 + 2.0 * part) * (1.0 - part) ** 2 + there * part**2 * (3.0 - 2.0 * part)
+    of_slopes = width * (here * part * (1.0 - part) ** 2 + there * part**2 * (part - 1.0))
+    differences = np.gradient(unit, slip, axis=1)
     return slip[cell] + width * part, cell, of_values, of_slopes, of_values + differences @ of_slopes
-
-
-def _interpolated(columns: Array, matrix: Array) -> Array:
-    """Columns (..., C, S), zero where not known, times an interpolation matrix (S, F): (..., C, F)."""
-    known = np.where(np.isfinite(columns), columns, 0.0)
-    return np.asarray(known.reshape(-1, len(matrix)) @ matrix).reshape(*columns.shape[:-1], -1)
-
-
-def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Where both ends of a step of the grid are balanced (D, F)."""
-    return np.asarray((balanced[:, :-1] & balanced[:, 1:])[:, cell])
-
-
-def _shares_to_limits(here: Array, there: Array, limits: Limits) -> Array:
-    """Shares of the step from here to there at which each limit is met, 1 where it is not.
-
-    All (D, G + A): of the torques by motor, then of the entry angles by kind of wheel.
-    """
-    limit = np.empty(here.shape)
-    limit[:, : len(limits.torque)], limit[:, len(limits.torque) :] = limits.torque, limits.angle
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(there > limit, (limit - here) / (there - here), 1.0)

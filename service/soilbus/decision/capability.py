@@ -5,16 +5,17 @@
     forecast         the least slip with pull(s) = demand, its sinkage and torque
     efficiency       eta(s) = P (1 - s) / (T / r)         drawbar power over axle power, the set point of each axle
 
-`assess` takes the posterior's sigma points, computes the wheels over slip on each of them (`wheels`, `balance`), maps
-the results to the posterior's mode and draws, and finds each quantity draw by draw: `sigma_points` gives mean and std.
+The wheels over slip (`wheels`, `balance`) are computed on the posterior's sigma points and mapped to its mode and
+draws; each quantity is found draw by draw, and `sigma_points` gives its mean and std.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,13 +27,10 @@ from soilbus.decision.balance import (
     Duty,
     Largest,
     Limits,
-    axle_sum,
+    at_pull,
     balance,
-    climbing,
     largest_pull,
-    point_of_pull,
     slips_of_most,
-    within,
 )
 from soilbus.decision.sigma_points import SigmaPoints, estimates, likely, mean_and_std
 from soilbus.decision.uncertain_model import ModelOfRows, UncertainModel
@@ -44,14 +42,10 @@ from soilbus.terra.wheel import WheelModel
 
 __all__ = ["Capability", "Demand", "Forecast", "OverSlip", "SetPoint", "assess", "slip_grid"]
 
-MIN_SLIP = 0.02
-"""Least slip of the grid.  No evidence recorded."""
+MIN_SLIP, MAX_SKID = 0.02, 0.3
+"""Least slip of driving wheels, and largest skid (minus slip) of wheels that are pushed.  No evidence recorded."""
 GRID_SLIPS = 9
-"""Number of slips of the grid of driving wheels."""
-MAX_SKID = 0.3
-"""Largest skid (minus slip) of the grid of wheels that are pushed.  No evidence recorded."""
-SKID_GRID_SLIPS = 9
-"""Number of slips of that grid."""
+"""Number of slips at which wheels are computed."""
 NEWTON_TOLERANCE = 3e-3
 """Last Newton step as a share of the weight: its error is below that of interpolation between slips, some 5e-5."""
 LEVEL_SINE = 1e-3
@@ -69,10 +63,10 @@ class Demand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OverSlip:
-    """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m].
+    """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m], with their std.
 
-    Equation 22 and figure 13 of Xi et al. 2024, with load transfer and standard deviations; nan where by the most
-    likely soil, or by most soils of the posterior, no wheel loads and sinkages are in balance.
+    Equation 22 and figure 13 of Xi et al. 2024, with load transfer; nan where by the most likely soil, or by most soils
+    of the posterior, no wheel loads and sinkages are in balance.
     """
 
     slip: Array
@@ -84,11 +78,7 @@ class OverSlip:
 
 @dataclass(frozen=True, slots=True)
 class SetPoint:
-    """Slips of one axle within the limits: of best traction efficiency, and of largest pull.
-
-    None where the axle most likely gives no pull.  Where pull over slip has two maxima of about the same height, the
-    mean lies between them and the std is large.
-    """
+    """Slips of one axle within the limits, of best traction efficiency and of largest pull; None without a pull."""
 
     efficiency: Estimate | None
     pull: Estimate | None
@@ -98,16 +88,8 @@ class SetPoint:
 class Forecast:
     """Steady driving under the present demand, on the soils on which some slip gives it.
 
-    Attributes
-    ----------
-    slip
-        Of the driven wheels.
-    sinkage, deepest
-        [m], by wheel, and of the deepest wheel.
-    torque
-        [N m], sum over the wheels.
-    likely_depth
-        [m], the deepest sinkage to first order, for probabilities.
+    slip: of the driven wheels.  sinkage, deepest [m]: by wheel, and of the deepest wheel.  torque [N m]: sum over the
+    wheels.  likely_depth [m]: the deepest sinkage to first order, for probabilities.
     """
 
     slip: Estimate
@@ -123,16 +105,12 @@ class Capability:
 
     Attributes
     ----------
-    max_draft
-        [N], on the level.
-    max_draft_here
-        [N], on the present slope.
+    max_draft, max_draft_here
+        [N], on the level and on the present slope.
     max_grade, max_grade_with_draft
         [rad], without draft and with the present one.
-    max_pull
-        [N], on the present slope, draft and slope together.
-    likely_pull
-        [N], max_pull to first order, for probabilities.
+    max_pull, likely_pull
+        [N], on the present slope, draft and slope together; the same to first order, for probabilities.
     limit
         What ends max_draft.
     set_points
@@ -162,12 +140,6 @@ def slip_grid(max_slip: float) -> Array:
     return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID_SLIPS) ** 2)
 
 
-@cache
-def skid_grid(max_slip: float) -> Array:
-    """Return the slips (SKID_GRID_SLIPS,) of wheels that are pushed, up to the least one of `slip_grid`."""
-    return np.linspace(-MAX_SKID, slip_grid(max_slip)[0], SKID_GRID_SLIPS)
-
-
 def assess(
     posterior: Posterior,
     rig: Rig,
@@ -178,16 +150,12 @@ def assess(
     max_sinkage: float,
     last: WheelTable | None = None,
 ) -> tuple[Capability | None, WheelTable]:
-    """Return the capability on one soil.
+    """Return the capability on one soil, None where no steady driving is within the limits, and the wheels' table.
 
     Parameters
     ----------
-    posterior
-        Of the soil.
-    rig
-        With a chassis.
-    model
-        The wheel-soil model.
+    posterior, rig, model
+        Of the soil; a rig with a chassis, else ValueError; the wheel-soil model.
     demand
         Present draft and slope; None where not known.
     torque_limit
@@ -196,63 +164,52 @@ def assess(
         Limits of slip and of sinkage [m].
     last
         The table of the window before, to start from.
-
-    Returns
-    -------
-    capability
-        None where no steady driving is within the slip and sinkage limits.
-    table
-        To start the next window's from.
-
-    Raises
-    ------
-    ValueError
-        For a rig without a chassis.
     """
     uncertain = UncertainModel.over(model)
     points = SigmaPoints.of(posterior, uncertain.shifts, float(rig.width.mean()))
-    driven = ~(torque_limit <= 0.0)
-    completed = uncertain.of_rows(len(points.soils))
-    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, NEWTON_TOLERANCE, driven)
-    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skid_grid(max_slip), driven=driven))
+    driven, grid = ~(torque_limit <= 0.0), slip_grid(max_slip)
+    table = wheel_table(points.soils, rig, uncertain, grid, last, NEWTON_TOLERANCE, driven)
+    skids = np.linspace(-MAX_SKID, grid[0], GRID_SLIPS)
+    axles, completed = table.axles, uncertain.of_rows(len(points.soils))
+    limits = Limits.of(axles, torque_limit, max_sinkage, completed)
     of_points = balance(table)
+    vehicle = _Vehicle(
+        table,
+        of_points,
+        points,
+        limits._replace(angle=points.drawn(limits.angle)),
+        cache(lambda: wheel_table(points.soils, rig, uncertain, skids, driven=driven)),
+    )
     level = of_points.drawn(points)
-    limits = Limits.of(table.axles, torque_limit, max_sinkage, completed)
-    limits = limits._replace(angle=points.drawn(limits.angle))
-    vehicle = _Vehicle(table, of_points, points, limits, skid)
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
-    pull = forecast = None
-    drafts = [0.0]
+    pull = with_draft = forecast = None
     if demand is not None:
         flat = abs(demand.sine) < LEVEL_SINE
         duty = Duty(None, demand.sine)
         here = of_points if flat else balance(table, duty, of_points)
         present = level if flat else here.drawn(points)
         pull = draft if flat else vehicle.largest(duty, present)
-        drafts.append(demand.pull - table.axles.weight * demand.sine)
-        forecast = _forecast(demand, here, present, table.axles, rig, completed, points)
-    grade, *with_draft = vehicle.grades(drafts)
-    max_draft, max_pull, max_grade, max_grade_with_draft = estimates(
-        draft.pull, None if pull is None else pull.pull, grade, *(with_draft or [None])
-    )
+        with_draft = vehicle.grade(demand.pull - axles.weight * demand.sine)
+        forecast = _forecast(demand, here, present, axles, rig, completed, points)
+    pulls = None if pull is None else pull.pull
+    max_draft, max_pull, max_grade, max_grade_with_draft = estimates(draft.pull, pulls, vehicle.grade(0.0), with_draft)
     if max_draft is None:
         return None, table
-    max_draft, likely_pull = _with_mass_error(max_draft, rig), likely(None if pull is None else pull.pull)
+    likely_pull, max_draft_here = likely(pulls), None
     max_pull = max_pull and _with_mass_error(max_pull, rig)
-    max_draft_here = None
     if demand is not None and max_pull is not None:
-        max_draft_here = Estimate(max_pull.value - table.axles.weight * demand.sine, max_pull.std)
+        max_draft_here = Estimate(max_pull.value - axles.weight * demand.sine, max_pull.std)
     return Capability(
-        max_draft=max_draft,
+        max_draft=_with_mass_error(max_draft, rig),
         max_draft_here=max_draft_here,
         max_grade=max_grade,
         max_grade_with_draft=max_grade_with_draft,
         max_pull=max_pull,
         likely_pull=likely_pull and _with_mass_error(likely_pull, rig),
         limit=draft.cause,
-        set_points=_set_points(table.axles, level, vehicle.limits, draft),
+        set_points=_set_points(axles, level, vehicle.limits, draft),
         forecast=forecast,
         over_slip=_over_slip(level, table),
     ), table
@@ -263,9 +220,8 @@ def _with_mass_error(pull: Estimate, rig: Rig) -> Estimate:
     return Estimate(pull.value, math.hypot(pull.std, rig.mass_std * pull.value)) if rig.mass_std else pull
 
 
-@dataclass(frozen=True, slots=True)
-class _Vehicle:
-    """Tables of driving wheels and (lazily) of skidding ones, of the sigma points; the limits are of the draws."""
+class _Vehicle(NamedTuple):
+    """Table and level balance of driving wheels, of the sigma points; limits of the draws; (lazily) skidding wheels."""
 
     table: WheelTable
     level: Balance
@@ -274,11 +230,7 @@ class _Vehicle:
     skid: Callable[[], WheelTable]
 
     def largest(self, duty: Duty, driving: Balance) -> Largest | None:
-        """Largest pull of each draw under a duty; None where nothing is within the limits.
-
-        Where the least slip already needs more torque than the limit, the wheels skid: the pull is negative, and only
-        a push or a slope moves the vehicle.
-        """
+        """Largest pull of each draw under a duty, skidding where motors are weak; None if the mode has none."""
         found = largest_pull(driving, self.limits)
         if not self.table.axles.driven.any():
             return found._replace(cause="torque")
@@ -286,32 +238,29 @@ class _Vehicle:
         if not lost.any():
             return found
         no_torque = self.limits._replace(torque=np.full_like(self.limits.torque, np.inf))
-        weak = lost & within(driving, no_torque).any(axis=1)
-        if not weak.any():
-            return None if lost[0] else found
-        of_skid = self._skidding(duty)
-        pull, slip = (np.where(weak, *each) for each in ((of_skid.pull, found.pull), (of_skid.slip, found.slip)))
-        if not np.isfinite(pull[0]):
+        weak = lost & no_torque.allow(driving).any(axis=1)
+        if not weak[0] and lost[0]:
             return None
-        return Largest(pull, slip, "torque" if weak[0] else found.cause)
-
-    def _skidding(self, duty: Duty) -> Largest:
-        """Largest pull of skidding wheels; the least pull where every skid needs too much torque."""
+        if not weak.any():
+            return found
         skidding = balance(self.skid(), duty).drawn(self.points)
-        found = largest_pull(skidding, self.limits)
-        least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
-        pull = np.where(skidding.known.any(axis=1), skidding.pull[np.arange(len(least)), least], np.nan)
-        none = ~np.isfinite(found.pull)
-        return Largest(np.where(none, pull, found.pull), np.where(none, skidding.slip[least], found.slip), "torque")
+        pushed = largest_pull(skidding, self.limits)
+        pulls = np.where(skidding.known, skidding.pull, np.inf)
+        none = ~np.isfinite(pushed.pull) & skidding.known.any(axis=1)
+        pull = np.where(none, pulls.min(axis=1), pushed.pull)
+        slip = np.where(none, skidding.slip[pulls.argmin(axis=1)], pushed.slip)
+        if weak[0] and not np.isfinite(pull[0]):
+            return None
+        cause: Cause = "torque" if weak[0] else found.cause
+        return Largest(np.where(weak, pull, found.pull), np.where(weak, slip, found.slip), cause)
 
-    def grades(self, drafts: Sequence[float]) -> list[Array | None]:
-        """Steepest slope [rad] (1 + N,) that each draw climbs with each of the drafts [N]."""
-        slopes: list[Array | None] = []
-        for draft, of_points in zip(drafts, climbing(self.table, drafts, self.level), strict=True):
-            found = self.largest(Duty(draft, None), of_points.drawn(self.points))
-            rise = None if found is None else (found.pull - draft) / self.table.axles.weight
-            slopes.append(None if rise is None else np.arcsin(np.minimum(np.maximum(rise, -1.0), 1.0)))
-        return slopes
+    def grade(self, draft: float) -> Array | None:
+        """Steepest slope [rad] (1 + N,) that each draw climbs with a draft [N]."""
+        duty = Duty(draft, None)
+        found = self.largest(duty, balance(self.table, duty, self.level).drawn(self.points))
+        if found is None:
+            return None
+        return np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0))
 
 
 def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:
@@ -321,12 +270,12 @@ def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) ->
     none = {name: SetPoint(None, None) for name, kinds in of_axles.items() if kinds.any()}
     if not names:
         return none
-    values = np.empty((len(names), 2, *level.pull.shape))
-    for (efficiency, pull), kinds in zip(values, names.values(), strict=True):
-        force = axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
-        pull[:] = axle_sum(level.drawbar, axles, kinds)
-        np.divide(pull * (1.0 - level.slip), np.where(force > 0.0, force, -np.inf), out=efficiency)
-    slips = estimates(*slips_of_most(values.reshape(-1, *level.pull.shape), level, limits, draft.slip))
+    values = []
+    for kinds in names.values():
+        force = (axles.count[kinds] / axles.radius[kinds] * level.torque[:, kinds]).sum(axis=1)
+        pull = (axles.count[kinds] * level.drawbar[:, kinds]).sum(axis=1)
+        values += [pull * (1.0 - level.slip) / np.where(force > 0.0, force, -np.inf), pull]
+    slips = estimates(*slips_of_most(np.stack(values), level, limits, draft.slip))
     return none | {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
@@ -334,12 +283,12 @@ def _forecast(
     demand: Demand, here: Balance, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
 ) -> Forecast | None:
     """Slip, sinkage and torque at the least slip that gives the demand; None where most likely no slip does."""
-    point = point_of_pull(present, demand.pull)
-    torque = (point.on(present.torque) * axles.count[:, 0]).sum(axis=1)
-    slip = point.on(np.broadcast_to(present.slip, present.pull.shape))
+    on = at_pull(present, demand.pull)
+    torque = (on(present.torque) * axles.count[:, 0]).sum(axis=1)
+    slip = on(np.broadcast_to(present.slip, present.pull.shape))
     load = axles.loads(*Duty(None, demand.sine).split(here.pull, axles.weight))
     depth = model.sinkage(here.angle, Wheel(axles.radius, axles.width, ~axles.front, load))
-    depth = point.on(points.drawn(depth, here.known[:, None]))
+    depth = on(points.drawn(depth, here.known[:, None]))
     slip_needed, required, *depths = estimates(slip, torque, *depth.T)
     likely_depth = likely(depth[:, int(np.argmax(depth[0]))])
     if slip_needed is None or required is None or likely_depth is None:

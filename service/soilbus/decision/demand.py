@@ -25,24 +25,10 @@ NO_GAIN_ERROR = Estimate(0.0, 0.0)
 def present_demand(
     window: Window, chassis: Chassis | None, hop: float, gain: Estimate = NO_GAIN_ERROR
 ) -> Demand | None:
-    """Return the draft and slope over the last hop or the whole window, whichever mean is larger.
+    """Return the draft and slope over the last hop [s] or the whole forward window, whichever mean is larger.
 
-    Parameters
-    ----------
-    window
-        A forward window.
-    chassis
-        Mass and geometry; None gives no demand.
-    hop
-        [s].
-    gain
-        Relative gain error of the draft sensor.
-
-    Returns
-    -------
-    Demand
-        None where the draft of the last hop is not known.  Its std is of sensor noise and gain error; later changes of
-        the demand are covered by the configured margin.
+    None where the draft of the last hop is not known, or no chassis.  The std is of sensor noise and the draft's
+    relative gain error; later changes of the demand are covered by the configured margin.
     """
     if chassis is None or not len(window.t):
         return None
@@ -68,10 +54,7 @@ def _over(window: Window, chassis: Chassis, gain: Estimate) -> Demand:
 
 
 def _gravity_felt(window: Window) -> tuple[float, float]:
-    """Mean g sin(pitch) [m/s^2] that a specific force f shows, and its variance; 0 and 0 where it shows none.
-
-    d/dt (V - integral of f) = -g sin(pitch): minus the slope of a line, whose weights on f add up to one as well.
-    """
+    """Mean g sin(pitch) [m/s^2] and its variance, 0 where not known: -d/dt (V - integral of specific force)."""
     known = np.isfinite(window.acceleration) & np.isfinite(window.ground_speed)
     if np.count_nonzero(known) < LEAST_BINS:
         return 0.0, 0.0

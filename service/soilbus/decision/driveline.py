@@ -9,43 +9,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.instrumentation import Coupling
 from soilbus.estimation.window import Rig, Window
 from soilbus.sensors.options import CONSISTENCY
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which wheels do not drive: without torque while another one pulls, for most of the time after `since`.
+    """Return which wheels (W,) do not drive: without torque while another pulls, for most of the time after `since`.
 
-    Parameters
-    ----------
-    window
-        A forward window.
-    rig
-        Radius of each wheel.
-    since
-        [s].
-    before
-        (W,), the result before, kept where no wheel pulls or a torque is not known.
-
-    Returns
-    -------
-    NDArray
-        (W,).  Such a wheel rolls, even if its motor reports a torque limit.
-
-    Notes
-    -----
-    Behind a shaft that drives both axles no torque of one axle is measured: there speeds say whether it is engaged.
+    The result before is kept where no wheel pulls or a torque is not known.  On a shaft that drives both axles, where
+    no torque of one axle is measured, speeds say it.
     """
     window = window.rows(np.flatnonzero(window.t > since))
-    of_shaft, apart = _disengaged(window, rig, before)
-    return np.where(of_shaft, apart, _without_torque(window, rig, before))
+    return np.where(on_shaft(rig), _disengaged(window, rig, before), _without_torque(window, rig, before))
+
+
+def on_shaft(rig: Rig) -> NDArray[np.bool_]:
+    """Return which wheels (W,) are on a locked shaft to both axles; one that is idle there is disengaged."""
+    found = np.zeros(len(rig.wheels), bool)
+    for coupling in _shafts(rig):
+        found[[*coupling.one, *coupling.other]] = True
+    return found
 
 
 def shared_out(limit: NDArray[np.float64], apart: NDArray[np.bool_], rig: Rig) -> NDArray[np.float64]:
-    """Return the torque limits (W,) [N m] where a motor's whole torque goes to the wheels that it still turns.
-
-    limit: as the motors share it out among all their wheels; apart: disengaged wheels (W,).
-    """
+    """Return the torque limits (W,) [N m] where motors turn no wheels that are `apart` (disengaged)."""
     if rig.instrumentation is None or not apart.any():
         return limit
     limit = limit.copy()
@@ -71,35 +59,31 @@ def _without_torque(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDAr
     return np.where(2 * known.sum(axis=0) > len(known), 2 * still.sum(axis=0) > known.sum(axis=0), before)
 
 
-def disengaged(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which wheels (W,) a shaft of both axles does not turn after `since` [s], by speeds; else as before."""
-    of_shaft, apart = _disengaged(window.rows(np.flatnonzero(window.t > since)), rig, before)
-    return of_shaft & apart
-
-
-def _disengaged(window: Window, rig: Rig, before: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Wheels (W,) on a locked shaft to both axles, and which of them it does not turn; as before where it drives none.
-
-    A shaft that drives turns both axles alike.  The axle that it does not turn is slower, and not faster than the
-    ground, for it is pushed.
-    """
-    of_shaft, apart = np.zeros(len(rig.wheels), bool), before.copy()
+def _shafts(rig: Rig) -> list[Coupling]:
+    """Locked couplings between the axles that one motor drives."""
     given = rig.instrumentation
     if given is None:
-        return of_shaft, apart
-    turns = np.where(given.without_speed, np.nan, given.ratio * window.speed)
+        return []
+    driven = [set(motor.wheels) for motor in given.motors]
+    between = [coupling for coupling in given.couplings if coupling.locked and not coupling.of_axle]
+    return [each for each in between if any({*each.one, *each.other} <= wheels for wheels in driven)]
+
+
+def _disengaged(window: Window, rig: Rig, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which wheels (W,) a shaft does not turn: slower than the other axle's, and pushed; else as before."""
+    apart = before.copy()
+    if rig.instrumentation is None:
+        return apart
+    turns = np.where(rig.instrumentation.without_speed, np.nan, rig.instrumentation.ratio * window.speed)
     rolls = rig.radius * window.speed - window.ground_speed[:, None]
-    for coupling in given.couplings:
-        wheels = [*coupling.one, *coupling.other]
-        if coupling.of_axle or not coupling.locked or not any(set(wheels) <= set(m.wheels) for m in given.motors):
-            continue
-        of_shaft[wheels] = True
+    for coupling in _shafts(rig):
         one, other = (turns[:, list(part)].mean(axis=1) for part in (coupling.one, coupling.other))
-        drives = np.isfinite(one + other) & (window.torque[:, wheels].sum(axis=1) > 0.0)
+        torque = window.torque[:, [*coupling.one, *coupling.other]].sum(axis=1)
+        drives = np.isfinite(one + other) & (torque > 0.0)
         if 2 * drives.sum() <= len(drives):
             continue
         for part, own, others in ((coupling.one, one, other), (coupling.other, other, one)):
             pushed = rolls[:, list(part)].mean(axis=1) <= 0.0
             slower = own < (1.0 - CONSISTENCY.gear_slack) * others
             apart[list(part)] = 2 * (pushed & slower & drives).sum() > drives.sum()
-    return of_shaft, apart
+    return apart

@@ -4,8 +4,7 @@
     P(depth)    = Phi((max_sinkage - sinkage of the deepest wheel) / sd)
     P           = min(P(pull), P(depth)) -> go, caution or no_go by the configured thresholds
 
-`judge` decides when a window ends.  `at_present` says what remains of that decision later, when its data have aged, the
-vehicle has moved on, or the wheels show less pull than predicted.
+`judge` decides when a window ends; `at_present` says what remains of it later.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
-from soilbus.decision.capability import Capability, Demand, OverSlip, assess
+from soilbus.decision.capability import Demand, OverSlip, assess
 from soilbus.decision.traversability import State, Status, Traversability, state_of
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.watch import Watch
@@ -40,27 +39,20 @@ def judge(
     settings: Settings,
     last: WheelTable | None = None,
 ) -> tuple[Traversability, WheelTable | None]:
-    """Decide whether the vehicle can go on, on the ground of one window.
+    """Return whether the vehicle can go on, on the ground of one window, and the table to start the next one from.
 
     Parameters
     ----------
     posterior, status
         Of the window's soil; None where there is no estimate.
     demand
-        Draft and slope; None where not known.  Only a valid status and a known demand can give go.
-    rig, model
-        The vehicle and its wheel-soil model.
+        Draft and slope, None where not known; only a valid status and a known demand can give go.
     torque_limit
         (W,) [N m], nan where not known.
     settings
         Limits of slip and sinkage, margin, thresholds.
     last
         The table of the window before, to start from.
-
-    Returns
-    -------
-    decision, table
-        The decision, and the table to start the next window from (None where there is none).
     """
     available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
     if posterior is None or status is Status.INVALID or rig.chassis is None:
@@ -79,10 +71,13 @@ def judge(
     )
     if demand is None:
         return decision, table
-    spare = spare_pull(capability, demand, settings)
-    pull = 0.0 if spare is None else _above(spare.value, spare.std)
-    depth = probability_of_depth(capability, settings)
-    forecast = capability.forecast
+    spare, pull, depth, forecast = None, 0.0, 1.0, capability.forecast
+    if (likely := capability.likely_pull) is not None:  # some steady driving exists
+        needed = demand.pull + settings.margin * max(demand.pull, 0.0)
+        spare = Estimate(likely.value - needed, math.hypot(likely.std, demand.std))
+        pull = _above(spare.value, spare.std)
+    if forecast is not None:  # some slip gives the demand
+        depth = _above(settings.max_sinkage - forecast.likely_depth.value, forecast.likely_depth.std)
     return replace(
         decision,
         state=state_of(min(pull, depth), status, settings),
@@ -92,22 +87,6 @@ def judge(
         limit=capability.limit if pull <= depth else "sinkage",
         spare=spare,
     ), table
-
-
-def spare_pull(capability: Capability, demand: Demand, settings: Settings) -> Estimate | None:
-    """Return the pull [N] on the present slope less the demand and its margin; None where no steady driving exists."""
-    if capability.likely_pull is None:
-        return None
-    needed = demand.pull + settings.margin * max(demand.pull, 0.0)
-    return Estimate(capability.likely_pull.value - needed, math.hypot(capability.likely_pull.std, demand.std))
-
-
-def probability_of_depth(capability: Capability, settings: Settings) -> float:
-    """Return the probability that the deepest wheel stays within max_sinkage; 1 where no slip gives the demand."""
-    if capability.forecast is None:
-        return 1.0
-    deepest = capability.forecast.likely_depth
-    return _above(settings.max_sinkage - deepest.value, deepest.std)
 
 
 class Basis(NamedTuple):
@@ -131,29 +110,14 @@ class Basis(NamedTuple):
 def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float, config: Config) -> Traversability:
     """Return a window's decision as far as it holds at a later time.
 
-    A decision is valid for the time and place of its data, and is overruled by what the wheels show:
+    - stuck: no_go, and no figure of the estimate; - with a wheel that spins, or while immobilisation is warned of: no
+    better than caution; - data older than `max_age`, or on ground further back than the wheelbase, behind which the
+    rear wheels stand: unknown; - wheels that pull less at their present slip than the estimate predicts: the spare pull
+    is reduced by the miss; - wheels that slip more than the present pull needs, or the forecast where it is not known:
+    no better than caution; - with less than `min_share` of a window measured since a wheel last spun: no better than
+    caution.
 
-    - stuck: no_go, and no figure of the estimate;
-    - with a wheel that spins, or while immobilisation is warned of: no better than caution;
-    - data older than `max_age`, or on ground further back than the wheelbase: unknown;
-    - wheels that pull less at their present slip than the estimate predicts: the spare pull is reduced by the miss;
-    - wheels that slip more than the present pull needs by the estimate, or the forecast where that pull is not known:
-      no better than caution;
-    - with less than `min_share` of a window measured since a wheel last spun: no better than caution.
-
-    Parameters
-    ----------
-    decision
-        The decision when the window ended.
-    basis
-        Its data.
-    watch
-        As of now: what wheels and vehicle do, and whether immobilisation is warned of.
-    now
-        [s], the time of the data.
-    config
-        Of `max_age`, `min_share` and `contradiction`; of the wheelbase, after which rear wheels stand where front
-        wheels stood; of the sensors' gain errors.
+    now [s]: the time of the data.  watch: as of then.
     """
     settings, length = config.traversability, 0.0 if config.vehicle is None else config.vehicle.wheelbase
     if watch.stuck:
@@ -169,90 +133,59 @@ def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float,
     if not (now - basis.end <= settings.max_age and basis.unseen <= length):  # nor nan
         return replace(decision, state=State.UNKNOWN, probability=None)
     if decision.state is State.GO and decision.capability is not None and decision.spare is not None:
-        missing = missing_pull(watch, decision.capability.over_slip, config.noise, settings.contradiction)
+        curve = _Curve.of(decision.capability.over_slip, config.noise)
+        missing = curve.missing_pull(watch.slip, watch.pull, settings.contradiction)
         left = _above(decision.spare.value - missing, decision.spare.std)
         if left < settings.go:
             return replace(decision, state=State.CAUTION, probability=left, contradicted="slip")
         forecast = decision.capability.forecast
         predicted = None if forecast is None else forecast.slip
         if math.isfinite(watch.pull):
-            predicted = slip_needed(watch.pull, decision.capability.over_slip, config.noise)
-        if predicted is not None and excess_slip(watch, predicted, config, settings.contradiction) > 0.0:
-            return replace(decision, state=State.CAUTION, probability=None, contradicted="slip")
+            predicted = curve.slip_needed(watch.pull)
+        if predicted is not None:
+            sd = math.hypot(predicted.std, (1.0 - watch.slip) * curve.slip_gain, config.warning.slip_noise)
+            if watch.slip - predicted.value > settings.contradiction * sd:  # nor nan
+                return replace(decision, state=State.CAUTION, probability=None, contradicted="slip")
     measured = np.count_nonzero(basis.instants > watch.last) * basis.each
     if decision.state is State.GO and measured < settings.min_share * config.estimator.window:
         return replace(decision, state=State.CAUTION, probability=None)
     return decision
 
 
-def missing_pull(watch: Watch, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
-    """Return the pull [N] by which the wheels give significantly less than predicted at their slip; else 0.
+class _Curve(NamedTuple):
+    """Pull over slip where it is known, its std, and the gain errors of slip (of both speeds) and draft."""
 
-    Parameters
-    ----------
-    watch
-        With the present slip and pull.
-    curve
-        Predicted pull over slip.
-    noise
-        Gain errors of the speed, ground speed and draft sensors.
-    deviations
-        Standard deviations of the innovation that are subtracted.
+    slip: NDArray[np.float64]
+    pull: NDArray[np.float64]
+    std: NDArray[np.float64]
+    slip_gain: float
+    draft_gain: float
 
-    Notes
-    -----
-    The innovation is P(s) - P.  Its variance is that of the curve, of the slip (gain errors of both speeds) and of the
-    draft's gain error.
-    """
-    known = np.isfinite(curve.pull)
-    if not known.any() or not math.isfinite(watch.slip + watch.pull) or watch.slip < curve.slip[0]:
-        return 0.0
-    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
-    predicted, std = float(np.interp(watch.slip, slips, pulls)), float(np.interp(watch.slip, slips, stds))
-    slope = float(np.interp(watch.slip, slips, np.gradient(pulls, slips))) if len(slips) > 1 else 0.0
-    of_slip = slope * (1.0 - watch.slip) * math.hypot(noise.speed.gain, noise.ground_speed.gain)
-    sd = math.hypot(std, of_slip, noise.draft.gain * watch.pull)
-    return max(predicted - watch.pull - deviations * sd, 0.0)
+    @classmethod
+    def of(cls, curve: OverSlip, noise: NoiseOfChannels) -> _Curve:
+        known = np.isfinite(curve.pull)
+        gain = math.hypot(noise.speed.gain, noise.ground_speed.gain)
+        return cls(curve.slip[known], curve.pull[known], curve.pull_std[known], gain, noise.draft.gain)
 
+    def missing_pull(self, slip: float, pull: float, deviations: float) -> float:
+        """Pull [N] by which the wheels give less than predicted at their slip, beyond so many sd of this innovation."""
+        if not len(self.slip) or not math.isfinite(slip + pull) or slip < self.slip[0]:
+            return 0.0
+        predicted, std = float(np.interp(slip, self.slip, self.pull)), float(np.interp(slip, self.slip, self.std))
+        slope = float(np.interp(slip, self.slip, np.gradient(self.pull, self.slip))) if len(self.slip) > 1 else 0.0
+        sd = math.hypot(std, slope * (1.0 - slip) * self.slip_gain, self.draft_gain * pull)
+        return max(predicted - pull - deviations * sd, 0.0)
 
-def excess_slip(watch: Watch, predicted: Estimate, config: Config, deviations: float) -> float:
-    """Return the slip by which the wheels slip significantly more than predicted; else 0.
-
-    Parameters
-    ----------
-    watch
-        With the present slip.
-    predicted
-        Slip that the present pull needs (`slip_needed`), or where that is not known the present demand.
-    config
-        Gain errors of both speeds; slip by uneven ground.
-    deviations
-        Standard deviations of the innovation that are subtracted.
-    """
-    if not math.isfinite(watch.slip):
-        return 0.0
-    of_gains = (1.0 - watch.slip) * math.hypot(config.noise.speed.gain, config.noise.ground_speed.gain)
-    sd = math.hypot(predicted.std, of_gains, config.warning.slip_noise)
-    return max(watch.slip - predicted.value - deviations * sd, 0.0)
-
-
-def slip_needed(pull: float, curve: OverSlip, noise: NoiseOfChannels) -> Estimate | None:
-    """Return the least slip that gives a pull [N]; None where none does, or where slip hardly changes the pull.
-
-    Notes
-    -----
-    ds = dP / (dP/ds), with the curve's std and the draft's gain error in dP.
-    """
-    known = np.isfinite(curve.pull)
-    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
-    if len(slips) < 2 or not pull < pulls.max():
-        return None
-    i = max(int(np.argmax(pulls > pull)), 1)
-    slope = float((pulls[i] - pulls[i - 1]) / (slips[i] - slips[i - 1]))
-    if slope <= 0.0:
-        return None
-    slip = max(float(slips[i] - (pulls[i] - pull) / slope), 0.0)
-    return Estimate(slip, math.hypot(float(np.interp(slip, slips, stds)), noise.draft.gain * pull) / slope)
+    def slip_needed(self, pull: float) -> Estimate | None:
+        """Least slip that gives a pull [N], ds = dP / (dP/ds); None where none does, or it hardly changes the pull."""
+        if len(self.slip) < 2 or not pull < self.pull.max():
+            return None
+        i = max(int(np.argmax(self.pull > pull)), 1)
+        slope = float((self.pull[i] - self.pull[i - 1]) / (self.slip[i] - self.slip[i - 1]))
+        if slope <= 0.0:
+            return None
+        slip = max(float(self.slip[i] - (self.pull[i] - pull) / slope), 0.0)
+        return Estimate(slip, math.hypot(float(np.interp(slip, self.slip, self.std)), self.draft_gain * pull) / slope)
 
 
 def _above(margin: float, std: float) -> float:

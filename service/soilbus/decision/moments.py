@@ -4,9 +4,8 @@
     resistance                 (sum(T / r) - pull) / (m g)
     common slip                e^(-b s) = mean of e^(-b s_w)      mu = mu_max (1 - e^(-b s)) (Brixius 1987)
 
-Wheels on a differential share a torque: as load shifts between them, the lighter one gains more slip than the other
-loses, and their mean slip grows at the same pull.  The common slip, at which both would give what they give, hardly
-grows.
+Wheels on a differential share a torque: as load shifts between them, their mean slip grows at the same pull.  The
+common slip, at which both would give what they give, hardly grows.
 """
 
 from __future__ import annotations
@@ -24,32 +23,15 @@ from soilbus.decision.options import WATCH
 from soilbus.estimation.window import Rig, Window, inertia_of, pairs, pull_given
 from soilbus.terra.vehicle import GRAVITY, slip_ratio
 
-__all__ = ["Moment", "Sample", "bins_of_a_moment", "common_slip", "moment_of", "moments"]
-
 
 class Sample(NamedTuple):
     """Readings of one bin; nan where not known.
 
-    Attributes
-    ----------
-    t
-        [s].
-    ground, ground_var
-        [m/s], ground speed of the vehicle's middle, and its variance.
-    rim, rim_var
-        [m/s], mean rim speed of the driven wheels whose speed is known, and its variance.
-    thrust
-        Sum of torque over radius, as a share of the weight.
-    beside
-        [m/s], mean ground speed of those wheels less that of the middle: not zero on a curve with a side missing.
-    at_limit
-        Every motor whose limit is known is at its limit, and at least one limit is known.
-    depth, depth_var
-        [m], sinkage of the deepest wheel, and its variance.
-    felt
-        [m/s^2], dv/dt + g sin(pitch), where a specific force is measured and the pitch is not.
-    draft
-        As a share of the weight.
+    t [s]; ground [m/s]: ground speed of the vehicle's middle; rim [m/s]: mean rim speed of the driven wheels whose
+    speed is known; thrust, draft: sum of torque over radius, and draft, as shares of the weight; beside [m/s]: mean
+    ground speed of those wheels less that of the middle, not zero on a curve with a side missing; at_limit: as of
+    `Moment`; depth [m]: of the deepest wheel; felt [m/s^2]: dv/dt + g sin(pitch) where a specific force is measured and
+    no pitch.
     """
 
     t: float
@@ -69,31 +51,14 @@ class Sample(NamedTuple):
 class Moment(NamedTuple):
     """Means of the readings over some bins; nan where not known.
 
-    Attributes
-    ----------
-    t
-        [s], of the last bin.
-    ground, rim, beside
-        [m/s], ground speed of the vehicle's middle, rim speed of each wheel that a motor can drive, and ground speed of
-        each of these less that of the middle (on a curve).
-    resistance
-        Thrust less draft, slope and inertia, as a share of the weight.
-    at_limit
-        Every motor whose limit is known is at its limit, and at least one limit is known.
-    slip
-        Torque-weighted mean of the driving wheels.
-    pull
-        [N], of draft, slope and inertia; nan where the acceleration is not measured.
-    last
-        The last bin by itself.
-    torque, reserve
-        [N m], of each of these wheels; whether it is known to be below its limit.
-    common, engaged
-        Common slip of the wheels that do drive, and which of all wheels these are.
-    given, inertia
-        [N], pull as far as it is measured, and the part of it that speeds the vehicle up.
-    mass
-        [kg], of the vehicle.
+    t [s]: of the last bin.  ground, rim, beside [m/s]: ground speed of the vehicle's middle, rim speed of each wheel
+    that a motor can drive, and ground speed of each of these less that of the middle (on a curve).  resistance: thrust
+    less draft, slope and inertia, as a share of the weight.  at_limit: every motor whose limit is known is at its
+    limit, and at least one limit is known.  slip, common: torque-weighted mean of the driving wheels, and common slip
+    of all that do drive.  given, inertia, pull [N]: pull as far as it is measured, the part of it that speeds the
+    vehicle up, and all of it, nan where no acceleration is measured.  last: the last bin by itself.  torque [N m],
+    reserve: of each wheel that a motor can drive, and whether it is known to be below its limit.  engaged: which of all
+    wheels drive.  mass [kg].
     """
 
     t: float
@@ -115,15 +80,7 @@ class Moment(NamedTuple):
 
 
 def common_slip(slips: Sequence[float], exponent: float = WATCH.slip_exponent) -> float:
-    """Return the slip at which all wheels would give the mean of what they give at their own slips.
-
-    Parameters
-    ----------
-    slips
-        Of one wheel or more, of like size.
-    exponent
-        b, growth of the traction ratio with slip.
-    """
+    """Return the slip at which all wheels would give the mean of what they give at their own slips, of one or more."""
     least = min(slips)
     mean = sum(math.exp(exponent * (least - slip)) for slip in slips) / len(slips)
     return least - math.log(mean) / exponent
@@ -137,30 +94,17 @@ def bins_of_a_moment(bin_length: float) -> int:
 def moment_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], config: Config) -> Moment | None:
     """Return the mean over a short forward window; None without a bin or a chassis.  Parameters as of `moments`."""
     bins = len(window.t)
-    found = moments(window, rig, torque_limit, config, np.arange(bins)[-1:], bins)
-    return found[0] if found else None
+    return next(iter(moments(window, rig, torque_limit, config, np.arange(bins)[-1:], bins)), None)
 
 
 def moments(
     window: Window, rig: Rig, torque_limit: NDArray[np.float64], config: Config, chosen: NDArray[np.intp], bins: int
 ) -> list[Moment]:
-    """Return the means over the last bins at each of some bins of a forward window.
+    """Return the means at some bins of a forward window, each over the last bins there.
 
-    Parameters
-    ----------
-    window
-        A forward window.
-    rig
-        With a chassis and wheels, else there are no moments.
-    torque_limit
-        (W,) [N m], nan where not known, 0 of a wheel that rolls freely.
-    config
-        `full_torque`, share of the limit from which a motor is at its limit; `min_speed` [m/s], ground speed up to
-        which slip is nan.
-    chosen
-        (M,), the bins at which each mean ends.
-    bins
-        Over how many each mean goes, fewer at the window's begin.
+    torque_limit (W,) [N m]: nan where not known, 0 of a wheel that rolls freely.  config: `full_torque`, `min_speed`,
+    up to which slip is nan.  chosen (M,): the bins at which each mean ends.  bins: over how many, fewer at the window's
+    begin.
     """
     if not len(chosen) or rig.chassis is None or not rig.wheels:
         return []
@@ -172,23 +116,24 @@ def moments(
     slips = np.where(slips > -1.0, slips, np.nan)
     if rig.instrumentation is not None:
         slips[:, rig.instrumentation.without_speed] = np.nan  # their speed is assumed
+    lever = np.zeros(len(radius))  # by which a yaw rate, positive to the left, adds to a wheel's ground speed
+    if rig.track is not None:
+        left, right = pairs(rig)
+        lever[left], lever[right] = -rig.track / 2.0, rig.track / 2.0
     inertia = np.where(np.isfinite(given), inertia_of(window, rig.chassis), np.nan)
     n, w = 4, len(radius)
     columns = np.column_stack(
         [speed, given, inertia, window.yaw_rate, radius * window.speed, window.torque, slips[:, engaged]]
     )
     place = chosen[:, None] + np.arange(1 - bins, 1)
-    there, place = place >= 0, np.maximum(place, 0)
-    known = np.isfinite(columns)
-    values, counts = np.where(known, columns, 0.0)[place], known[place]
-    accelerates = (np.isfinite(window.acceleration)[place] & there).any(axis=1)
-    if not there.all():
-        values[~there], counts[~there] = 0.0, False
+    taken = np.where((place >= 0)[..., None], columns[np.maximum(place, 0)], np.nan)
+    known = np.isfinite(taken)
+    accelerates = (np.isfinite(window.acceleration)[place] & (place >= 0)).any(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        means = values.sum(axis=1) / counts.sum(axis=1)
+        means = np.where(known, taken, 0.0).sum(axis=1) / known.sum(axis=1)
         ground, given, inertia, yaw_rate = means[:, :n].T
         rim, torque, slips = means[:, n : n + w], means[:, n + w : n + 2 * w], means[:, n + 2 * w :]
-        beside = _side(rig) * np.where(np.isfinite(yaw_rate), yaw_rate, 0.0)[:, None]
+        beside = lever * np.where(np.isfinite(yaw_rate), yaw_rate, 0.0)[:, None]
         limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
         full = torque >= config.traversability.full_torque * torque_limit
         at_limit = limited.any() & (full | ~limited).all(axis=1)
@@ -198,33 +143,16 @@ def moments(
         slip = slip.sum(axis=1) / weights.sum(axis=1)
     pull = np.where(accelerates, given, np.nan)
     common = [common_slip(row) if (row := s[np.isfinite(s)].tolist()) else math.nan for s in slips]
-    of_wheels = (values[:, drives].tolist() for values in (rim, beside, torque, limited & ~full))
     lasts = _samples(window.rows(chosen), rig, beside, at_limit)
-    scalars = (values.tolist() for values in (window.t[chosen], ground, resistance, at_limit, slip, pull))
-    forces, drive = zip(given.tolist(), np.nan_to_num(inertia).tolist(), strict=True), tuple(engaged.tolist())
+    rims, besides, torques, reserves = (v[:, drives].tolist() for v in (rim, beside, torque, limited & ~full))
+    of_vehicle = (window.t[chosen], ground, resistance, at_limit, slip, pull, given, np.nan_to_num(inertia))
+    columns_of = zip(*(values.tolist() for values in of_vehicle), strict=True)
+    drive = tuple(engaged.tolist())
     return [
-        Moment(
-            t,
-            ground,
-            rim,
-            resistance,
-            at_limit,
-            slip,
-            pull,
-            last,
-            beside,
-            torque,
-            reserve,
-            same,
-            drive,
-            whole,
-            part,
-            mass,
-        )
-        for t, ground, resistance, at_limit, slip, pull, rim, beside, torque, reserve, last, same, (whole, part) in zip(
-            *scalars, *of_wheels, lasts, common, forces, strict=True
-        )
-    ]
+        Moment(t, ground, rims[i], resistance, limit, slip, pull, lasts[i], besides[i], torques[i], reserves[i],
+               common[i], drive, given, inertia, mass)
+        for i, (t, ground, resistance, limit, slip, pull, given, inertia) in enumerate(columns_of)
+    ]  # fmt: skip
 
 
 def _samples(window: Window, rig: Rig, beside: Array, at_limit: NDArray[np.bool_]) -> list[Sample]:
@@ -257,12 +185,3 @@ def _samples(window: Window, rig: Rig, beside: Array, at_limit: NDArray[np.bool_
         window.draft / weight,
     )
     return list(map(Sample, *(column.tolist() for column in columns)))
-
-
-def _side(rig: Rig) -> Array:
-    """Lever [m] (W,) by which a yaw rate, positive to the left, adds to a wheel's ground speed; 0 without a track."""
-    lever = np.zeros(len(rig.wheels))
-    if rig.track is not None:
-        left, right = pairs(rig)
-        lever[left], lever[right] = -rig.track / 2.0, rig.track / 2.0
-    return lever

@@ -1,16 +1,13 @@
 """Options of the watch for immobilisation: its tuning values, each once, with unit and source or evidence.
 
-    WatchOptions -> watch.watched, moments.moments
+    WatchOptions -> watch.watched, stall.stalling, margin.left_by, moments.moments
 
-What a change of 30 % does to each is in service/docs/sensitivity.md.  What an operator may want to change is in
-`config.model.Warning`.
+What a change of 30 % does to each: service/docs/sensitivity.md.  What an operator may change: `config.model.Warning`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-__all__ = ["WATCH", "WatchOptions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,60 +15,42 @@ class WatchOptions:
     """Tuning values of the watch: means, trends, and causes to warn; shares are of the largest pull."""
 
     moment_span: float = 0.3
-    """Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake at 1.5 to
-    3 Hz.  With 0.12 s one bogging less was warned of in time on two of three machines (122 boggings, seed 71)."""
+    """Time [s] over which a moment's slip and pull are averaged: about half a period of loads that shake
+    at 1.5 to 3 Hz.  With 0.12 s one of 122 boggings less was warned of in time on two of three machines (seed 71)."""
     slip_exponent: float = 7.5
     """b [1]: gross traction ratio mu = mu_max (1 - e^(-b s)) over slip s (Brixius 1987, tyres in fields)."""
     settling_time: float = 2.0
-    """Age [s] of a trend from which it is used."""
-    curve_age: float = 30.0
-    """Age [s] up to which a window's curve is compared with: three windows.  At 60 s `b-2wd-loam` of the dynamic
-    drives, whose later windows fit no curve, had a false warning."""
-    memory: float = 10.0
-    """Moments are kept this long [s], and a demand's swings count as known from then on: some swings of a draft."""
+    """Age [s] of a trend from which it is used, and time after which what it foresaw is compared with what came."""
     slow_memory: float = 2.5
     """Time constant [s] of the trend of ground that softens over many metres, and of a demand."""
     fast_memory: float = 0.8
     """Time constant [s] of the trend of ground at a soft patch's edge."""
     scatter_lag: float = 0.5
-    """Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground."""
-    shake_memory: float = 5.0
-    """Time constant [s] of forgetting how much slip shakes: ten periods of a vehicle on its tyres."""
-
-    reckoning_time: float = 5.0
-    """Time [s] in which a ground speed reckoned from the acceleration returns to that of the wheels."""
-
+    """Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground.  For
+    so long a demand must be near the largest pull.  At 0.4 `e-plough-loam` and `b-2wd-loam` had a false warning
+    each."""
+    forgetting_time: float = 5.0
+    """Time [s] in which the past is forgotten: how much slip shakes, by how much a reckoned ground speed differs from
+    that of the wheels, and the last cause of a warning; ten periods of a vehicle on its tyres."""
     warning_time: float = 10.0
-    """Time [s] ahead within which a capacity is to fall to the demand, or a demand is to outgrow it."""
-    hold: float = 5.0
-    """Time [s] after its last cause at which such a warning ends."""
+    """Time [s] ahead within which a capacity is to fall to the demand, or a demand is to outgrow it, and back for which
+    moments are kept: some swings of a draft."""
     significant_sd: float = 2.5
     """Standard deviations by which a capacity must fall."""
     form_error: float = 0.1
-    """Sd of the share [1] by which a curve's reserve of pull is wrong, which its std does not say.  At 0.08 two furrows
-    of `e-plough-loam` warned, at 0.3 one of `b-plough-4wd`."""
-    check_lag: float = 2.0
-    """Time [s] after which an extrapolated demand is compared with what came."""
-    check_memory: float = 60.0
-    """Time constant [s] of forgetting these errors: some furrows, or swings of a draft."""
+    """Sd of the share [1] by which a curve's pull is wrong, which its std does not say.  A demand this near to the
+    largest pull warns whatever its trend: in 24 drives on loam where nobody gets stuck it reaches 0.89 of it.  No
+    larger std of the largest pull warns earlier.  At 0.08 two furrows of `e-plough-loam` warned, at 0.3 one of
+    `b-plough-4wd`."""
     outgrows: float = 0.83
     """Probability that a demand outgrows the ground from which it counts: between the ploughing of `b-plough-4wd`
     (0.80) and the grades of `decisions --boggings`."""
     least_share: float = 0.7
     """Share that a demand must have reached before its rise counts: lowering an implement is no trouble.  Without it
     two furrows of `e-plough-loam` warned."""
-    widest: float = 0.12
-    """Relative std of the largest pull above which its width gives no earlier warning."""
     unknown: float = 0.4
     """Relative std of the largest pull from which no demand is compared with it: `a-bog2` has 0.27 to 0.36 before it
     bogs, `b-clutch-easy-0` 0.43 and more where nothing happens."""
-    near: float = 0.9
-    """Share from which a demand warns whatever its trend: in 24 drives on loam where nobody gets stuck it reaches 0.89.
-    """
-    lasting: float = 0.4
-    """Time [s] for which a demand must outgrow the ground."""
-    lasting_fall: float = 0.2
-    """Time [s] for which the ground must weaken: at 0.4 the edge of a soft patch is felt 0.2 s too late."""
     draft_rise: float = 0.02
     """Rise of the draft above its mean of the last second, as a share of the weight, by which wheels slip more on any
     ground."""

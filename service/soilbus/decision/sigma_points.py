@@ -1,15 +1,14 @@
 """A posterior of the soil as a few sigma points, and mean and standard deviation of what follows from them.
 
-    log soil_d = log mode + L x_d                   x_d: points of `design` along principal directions, d = 1..D
+    log soil_d = log mode + L x_d                   x_d: points of a design along principal directions, d = 1..D
     K_L = k_c / b + k_phi                           its logarithm is linear in x_d, too; k_c is at most all of it
     f(draw) = sum_d share(draw, d) f(soil_d)        response surface (Box & Wilson 1951): polynomial through them
     mean, std of g(f)                               over 256 draws of standard normals with exact low moments
 
-The leading principal directions of the logarithms' covariance have a polynomial.  The first is the ridge on which k_c,
-k_phi and n replace each other (sd 0.3 to 1.6): forces are strongly nonlinear along it, so it has points of its own and
-degree 6.  The other directions are known so well that everything is linear in them: one point each.  Forces over slip
-(f) are smooth in the soil.  What the vehicle can do (g) is not: a torque limit ends the pull before the ground does,
-and the best slip jumps from one maximum to another.  So g is evaluated draw by draw.
+The first principal direction of the logarithms' covariance is the ridge on which k_c, k_phi and n replace each other
+(sd 0.3 to 1.6): forces are strongly nonlinear along it, so it has points of its own and degree 6.  In directions behind
+the leading ones everything is linear: one point each.  Forces over slip (f) are smooth in the soil.  What the vehicle
+can do (g) is not: a torque limit ends the pull before the ground does.  So g is evaluated draw by draw.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.polynomial.hermite_e import hermeval
+from numpy.polynomial.hermite_e import hermevander
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
@@ -36,10 +34,8 @@ SEED = 12
 limit cuts (2.5 % rms)."""
 NORMAL_MOMENTS = (1.0, 0.0, 1.0, 0.0, 3.0, 0.0, 15.0)
 """Moments of a standard normal, by degree."""
-MAX_ITERATIONS = 30
-"""Of the Gauss-Newton steps that make the draws' moments exact."""
-MOMENT_TOLERANCE = 1e-10
-"""Largest error of a moment of the draws that ends these steps."""
+GAUSS_NEWTON_STEPS = 30
+"""Steps that make the draws' moments exact."""
 LEADING_DIRECTIONS = 3
 """Number of principal directions in which the response surface is a polynomial."""
 FIRST_AXIS_POINTS = (1.2, 3.2)
@@ -50,6 +46,7 @@ _HELD_VARIANCE_RATIO = 1e-14
 """Variance of a direction over the largest one, below which the direction counts as known exactly."""
 LEAST_K_PHI = 1e-3
 """Least share of K_L that k_phi has at a point [1]: no force shows less."""
+NO_SHIFTS = np.zeros((0, len(Soil._fields)))
 _K_C, _K_PHI, _PHI = (Soil._fields.index(name) for name in ("k_c", "k_phi", "phi"))
 
 
@@ -57,15 +54,9 @@ _K_C, _K_PHI, _PHI = (Soil._fields.index(name) for name in ("k_c", "k_phi", "phi
 class SigmaPoints:
     """Sigma points of a posterior and the linear map from values at them to values at its mode and draws.
 
-    Attributes
-    ----------
-    soils
-        (D, 6), the mode first.  The last points are one standard deviation away along directions that are independent
-        of all others.
-    share
-        (1 + N, D), weight of each point in the value of the mode (first row) and of each of N draws.
-    mirror
-        (D,), index of the point on the other side of the mode; its own index where there is none.
+    soils (D, 6): the mode first; the last points are one standard deviation away along directions that are independent
+    of all others.  share (1 + N, D): weight of each point in the value of the mode (first row) and of each of N draws.
+    mirror (D,): index of the point on the other side of the mode; its own index where there is none.
     """
 
     soils: Array
@@ -73,49 +64,32 @@ class SigmaPoints:
     mirror: NDArray[np.intp]
 
     @classmethod
-    def of(cls, posterior: Posterior, shifts: Array | None = None, width: float | None = None) -> SigmaPoints:
+    def of(cls, posterior: Posterior, shifts: Array = NO_SHIFTS, width: float | None = None) -> SigmaPoints:
         """Return the points of a posterior; similar posteriors have similar points in the same order.
 
-        Parameters
-        ----------
-        posterior
-            Soil and covariance of its logarithms.
-        shifts
-            (Q, 6), changes of the logarithms that go with one standard deviation of Q other uncertain quantities.
-            Their outer products are part of the posterior's covariance.  They are the last points.
-        width
-            Mean tyre width b [m].  Wheels of one width determine K_L, whatever its parts: where k_phi is a small part,
-            its logarithm is open, and K_L still known.  None: k_c and k_phi follow their logarithms alone.
+        shifts (Q, 6): changes of the logarithms with one sd of Q other uncertain quantities, whose outer products are
+        part of the posterior's covariance; they are the last points.  width: mean tyre width b [m], which makes K_L
+        known where k_phi is a small part of it and its logarithm open; without it k_c and k_phi follow their logarithms
+        alone.
         """
-        along = np.zeros((0, len(posterior.soil))) if shifts is None else shifts
-        variance, directions = np.linalg.eigh(posterior.log_covariance - along.T @ along)
+        variance, directions = np.linalg.eigh(posterior.log_covariance - shifts.T @ shifts)
         free = np.flatnonzero(variance > _HELD_VARIANCE_RATIO * max(variance[-1], 0.0))[::-1]
         axes = directions[:, free] * np.sqrt(variance[free])
         axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
         leading = min(len(free), LEADING_DIRECTIONS)
-        points = design(leading)
-        steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, along])
+        points = _design(leading)
+        steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, shifts])
         soils = np.asarray(posterior.soil) * np.exp(steps)
         if width is not None:
-            soils[:, [_K_C, _K_PHI]] = moduli(posterior.soil, steps, width)
+            soils[:, [_K_C, _K_PHI]] = _moduli(posterior.soil, steps, width)
         soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
         return cls(soils, *_shares(leading, len(soils) - len(points)))
 
     def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
-        """Return values at the mode and the draws, from values at the points.
+        """Return values at the mode and the draws (1 + N, ..., F), from values at the points (D, ..., F).
 
-        Parameters
-        ----------
-        samples
-            (D, ..., F), values at the points.
-        known
-            Broadcastable to samples; None if all are known.  A value that is not known is mirrored about the mode's
-            from the point on the other side; where that is not known either, it is the mode's.
-
-        Returns
-        -------
-        Array
-            (1 + N, ..., F).  Of a result with three axes the second varies slowest in memory.
+        A value that is not known (a mask that broadcasts; None if all are) is mirrored about the mode's from the point
+        on the other side; where that is not known either, it is the mode's.
         """
         if known is not None and not known.all():
             known = np.broadcast_to(known, samples.shape)
@@ -126,8 +100,8 @@ class SigmaPoints:
         return np.asarray(self.share @ samples.reshape(len(samples), -1)).reshape(-1, *samples.shape[1:])
 
 
-def moduli(soil: Soil, steps: Array, width: float) -> Array:
-    """Return k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
+def _moduli(soil: Soil, steps: Array, width: float) -> Array:
+    """k_c and k_phi (D, 2) after steps (D, 6) of the logarithms, along which log K_L changes linearly."""
     part, whole = soil.k_c / width, soil.k_c / width + soil.k_phi
     K_L = whole * np.exp((part * steps[:, _K_C] + soil.k_phi * steps[:, _K_PHI]) / whole)
     of_k_c = np.minimum(part * np.exp(steps[:, _K_C]), (1.0 - LEAST_K_PHI) * K_L)
@@ -135,23 +109,13 @@ def moduli(soil: Soil, steps: Array, width: float) -> Array:
 
 
 def mean_and_std(samples: Array) -> tuple[Array, Array]:
-    """Return the mean and standard deviation over the draws.
+    """Return the mean and standard deviation (...,) over the draws that have a value.
 
-    Parameters
-    ----------
-    samples
-        (1 + N, ...), the value at the mode, then at the draws; nan where a draw has no value.
-
-    Returns
-    -------
-    mean, std
-        (...,) each, over the draws that have a value; nan where the mode or most draws have none.
+    samples (1 + N, ...): the value at the mode, then at the draws, nan where there is none; both are nan where the mode
+    or most draws have none.
     """
     change = samples[1:] - samples[0]
     known = np.isfinite(change)
-    if known.all():
-        mean = change.mean(axis=0)
-        return samples[0] + mean, np.sqrt(((change - mean) ** 2).mean(axis=0))
     count = known.sum(axis=0)
     of_count = 1.0 / np.maximum(count, 1)
     mean = np.where(known, change, 0.0).sum(axis=0) * of_count
@@ -161,10 +125,7 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
 
 
 def estimates(*samples: Array | None) -> list[Estimate | None]:
-    """Return the mean and std of scalars from their samples (1 + N,) each; None without samples or with nan.
-
-    With 256 draws, what happens on fewer than one soil in a hundred hardly enters the std.
-    """
+    """Return the mean and std of scalars from their samples (1 + N,) each; None without samples or with nan."""
     known = [each for each in samples if each is not None]
     if not known:
         return [None] * len(samples)
@@ -176,21 +137,10 @@ def estimates(*samples: Array | None) -> list[Estimate | None]:
 def likely(samples: Array | None) -> Estimate | None:
     """Return a first-order estimate of a scalar: its value at the mode and the std of its odd part.
 
-    Parameters
-    ----------
-    samples
-        (1 + N,), the value at the mode, then at pairs of a draw and its mirror image; nan where there is no value (then
-        the mirror image's is mirrored about the mode's).  None without samples.
-
-    Notes
-    -----
-    Mean-value first-order reliability.  It has no second-order term, so it gives the median of a monotonic function.
-    The mean would not do for probabilities: poorly determined soils lie along a curved valley of the likelihood, which
-    straight principal directions leave, and the second-order term there looks like a certain increase.
-
-    References
-    ----------
-    Cornell 1969, A probability-based structural code, ACI Journal 66:974.
+    samples (1 + N,): the value at the mode, then at pairs of a draw and its mirror image; where one has none (nan), the
+    other's is mirrored about the mode's.  Mean-value first-order reliability (Cornell 1969, ACI Journal 66:974): the
+    median of a monotonic function.  A mean would not do for probabilities: along the curved valley of poorly determined
+    soils its second-order term looks like a certain increase.
     """
     if samples is None:
         return None
@@ -198,22 +148,13 @@ def likely(samples: Array | None) -> Estimate | None:
     change = np.where(np.isnan(change), -change[:, ::-1], change)
     odd = 0.5 * (change[:, 0] - change[:, 1])
     known = odd[np.isfinite(odd)]
-    return _known(float(samples[0]), math.sqrt(float((known**2).sum()) / max(len(known), 1)))
+    value, std = float(samples[0]), math.sqrt(float((known**2).sum()) / max(len(known), 1))
+    return Estimate(value, std) if math.isfinite(value) else None
 
 
 @cache
-def design(n: int) -> Array:
-    """Return the design points (P, n) for n independent standard normals, the origin first.
-
-    Notes
-    -----
-    The vertices of a regular simplex, their mirror images and the middles of its edges, all projected on one sphere;
-    then the points of the first axis, on which one vertex also lies.
-
-    References
-    ----------
-    Lu & Darmofal 2004, SIAM J. Sci. Comput. 26:613 (the cubature).
-    """
+def _design(n: int) -> Array:
+    """Points (P, n) for n standard normals: origin, simplex and edges on a sphere (Lu & Darmofal 2004), first axis."""
     if n == 0:
         return np.zeros((1, 0))
     vertices = np.zeros((n + 1, n))
@@ -230,35 +171,18 @@ def design(n: int) -> Array:
 
 @cache
 def normals(n: int, leading: int) -> Array:
-    """Return the draws of n standard normals with exact low moments.
+    """Return draws (DRAWS, n) of n standard normals, each next to its mirror image; their covariance is the identity.
 
-    Parameters
-    ----------
-    n
-        Number of columns.
-    leading
-        Number of columns that have all moments of standard normals up to degree five; the first one up to seven.
-
-    Returns
-    -------
-    Array
-        (DRAWS, n), each draw next to its mirror image; the covariance is the identity.
-
-    Notes
-    -----
-    Pseudo-random draws, moved by least-norm Gauss-Newton steps until the moments hold: so polynomials of them have
-    nearly the right variance.
+    Of the leading columns all moments up to degree five are those of standard normals, of the first one up to seven.
     """
     if n == 0:
         return np.zeros((DRAWS, 0))
     z = np.random.default_rng(SEED).standard_normal((DRAWS // 2, n))
     degrees = _degrees(n, leading)
     wanted = np.prod(np.array(NORMAL_MOMENTS)[degrees], axis=1)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         value, slopes = _monomials(z, degrees)
         off = value.mean(axis=1) - wanted
-        if np.abs(off).max() < MOMENT_TOLERANCE:
-            break
         by_all = slopes.reshape(len(slopes), -1) / len(z)
         z = z - (by_all.T @ np.linalg.solve(by_all @ by_all.T, off)).reshape(z.shape)
     return np.stack([z, -z], axis=1).reshape(DRAWS, n)
@@ -267,7 +191,7 @@ def normals(n: int, leading: int) -> Array:
 @cache
 def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
     """share and mirror of SigmaPoints for these numbers of polynomial (leading) and linear directions."""
-    points = design(leading)
+    points = _design(leading)
     z = normals(leading + linear, leading)
     fit = np.linalg.pinv(_polynomials(points))
     of_draws = np.concatenate([_polynomials(z[:, :leading]) @ fit, z[:, leading:]], axis=1)
@@ -280,28 +204,21 @@ def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _polynomials(x: Array) -> Array:
-    """Orthonormal polynomials of standard normals (P, n): (P, terms).
-
-    All of degree up to two, those of the first column up to FIRST_AXIS_DEGREE, and its square times each other column
-    (not with two columns, where the points cannot separate that product from the other column itself).
-    """
+    """Orthonormal polynomials (P, terms) of standard normals (P, n): of degree two, and some with the first one."""
     n = x.shape[1]
     degrees = [d for d in itertools.product(range(3), repeat=n) if sum(d) <= 2]
     if n:
         degrees += [(d, *(0,) * (n - 1)) for d in range(3, FIRST_AXIS_DEGREE + 1)]
         degrees += [(2, *(int(i == k) for i in range(1, n))) for k in range(1, n) if n > 2]
-    terms = [math.prod((_hermite(column, d) for column, d in zip(x.T, of, strict=True)), start=1.0) for of in degrees]
-    return np.stack([np.broadcast_to(term, len(x)) for term in terms], axis=1)
-
-
-def _hermite(x: Array, degree: int) -> Array:
-    """Hermite polynomial with variance one under a standard normal."""
-    return np.asarray(hermeval(x, np.eye(degree + 1)[degree]) / math.sqrt(math.factorial(degree)))
+    size = np.sqrt([math.factorial(d) for d in range(FIRST_AXIS_DEGREE + 1)])
+    hermite = hermevander(x, FIRST_AXIS_DEGREE) / size  # of variance one
+    return np.stack([hermite[:, range(n), np.array(of, int)].prod(axis=1) for of in degrees], axis=1)
 
 
 def _degrees(n: int, leading: int) -> NDArray[np.intp]:
     """Degrees (Q, n) of the monomials whose mean is made exact; odd degrees are exact by symmetry."""
-    factors = [*combinations_with_replacement(range(n), 2), *combinations_with_replacement(range(leading), 4)]
+    of_all, of_leading = itertools.combinations_with_replacement(range(n), 2), range(leading)
+    factors = [*of_all, *itertools.combinations_with_replacement(of_leading, 4)]
     return np.array([np.bincount(each, minlength=n) for each in [*factors, *[(0,) * 6][:leading]]])
 
 
@@ -313,7 +230,3 @@ def _monomials(z: Array, degrees: NDArray[np.intp]) -> tuple[Array, Array]:
     lower = np.maximum(degrees[:, None] - np.eye(len(column), dtype=int), 0)
     slopes = degrees[..., None] * powers[lower, :, column].prod(axis=2)
     return value, slopes.transpose(0, 2, 1)
-
-
-def _known(value: float, std: float) -> Estimate | None:
-    return Estimate(value, std) if math.isfinite(value) else None

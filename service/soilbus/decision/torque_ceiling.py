@@ -1,19 +1,15 @@
 """Saturation: the greatest torque that a motor gives, from its torque alone, independent of any reported limit.
 
-Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked of the vehicle; at the ceiling it does
-not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
+Torque T of a wheel below its motor's ceiling follows the pull Q that is asked of the vehicle; at the ceiling it does
+not.  Over one span of bins, with means T', Q' and mean load N':
 
     follows      T - b (Q - Q') - T' (N / N' - 1) has no trend     b = T' / sum(T' / r): its share of the thrust
     saturated    T - T' is noise without trend, and T does not follow      a trend: a slope beyond its residuals
 
-What shakes the vehicle has no trend, however little its sensors say of their noise.
-A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
-it down is not asked of the motors: a vehicle that loses speed under a draft that rises while its torques stand has an
-unmet demand.  A ceiling is never exceeded, so only the highest torque measured so far can be one.
-
-A constant command below the ceiling, a pedal that is held, looks the same while it lasts.  So one plateau counts while
-the vehicle loses speed on it; a second one at the same level, with less torque between them, makes it a ceiling until
-the torque exceeds it.
+A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up.  A ceiling
+is never exceeded, so only the highest torque so far can be one.  A command held below it looks the same while it lasts:
+one plateau counts while the vehicle loses speed on it; a second one at the same level, with less torque between them,
+makes it a ceiling until the torque exceeds it.
 """
 
 from __future__ import annotations
@@ -34,16 +30,15 @@ LEAST_BINS = 4
 class TorqueCeiling:
     """Each wheel's (W,) ceiling, as measured in one recording; `after` takes the next window.
 
-    t [s]: end of the last span.  highest [N m]: largest mean of a span.  level [N m]: of the plateau on which the
-    wheel was saturated, nan without one; weight [1/(N m)^2]: the inverse variance of level.  lasts: the torque has not
-    been below the level since.  unmet: the vehicle lost speed on this plateau, and has not gained any since.  returned:
-    the torque was below the level, and the wheel was saturated at this level again.
+    t [s]: end of the last span.  highest [N m]: largest mean of a span.  level [N m]: of the plateau on which the wheel
+    was saturated last, nan without one.  lasts: the torque has not been below the level since.  unmet: the vehicle lost
+    speed on this plateau, and has not gained any since.  returned: the torque was below the level, and the wheel was
+    saturated at this level again.
     """
 
     t: float
     highest: Array
     level: Array
-    weight: Array
     lasts: Mask
     unmet: Mask
     returned: Mask
@@ -52,7 +47,7 @@ class TorqueCeiling:
     def unknown(cls, wheels: int) -> TorqueCeiling:
         """Return the state before any measurement."""
         no = np.zeros(wheels, bool)
-        return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), np.zeros(wheels), no, no, no)
+        return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), no, no, no)
 
     @property
     def limit(self) -> Array:
@@ -60,18 +55,10 @@ class TorqueCeiling:
         return np.where((self.lasts & self.unmet) | self.returned, self.level, np.nan)
 
     def after(self, window: Window, rig: Rig, span: float, deviations: float) -> TorqueCeiling:
-        """Return the ceiling after one more window, of which only new spans count.
+        """Return the ceiling after one more forward window with the true draft, of which only new spans count.
 
-        Parameters
-        ----------
-        window
-            A forward window, with the true draft.
-        rig
-            With a chassis, else nothing is known of the pull.
-        span
-            [s], length of a plateau, and time between two evaluations.
-        deviations
-            Standard deviations from which a difference is significant.
+        span [s]: length of a plateau, and time between two evaluations.  deviations: sd from which a difference is
+        significant.
         """
         if rig.chassis is None or not len(window.t):
             return self
@@ -86,27 +73,22 @@ class TorqueCeiling:
     def _after_span(self, window: Window, rig: Rig, deviations: float) -> TorqueCeiling:
         if len(window.t) < LEAST_BINS:
             return self
-        variance = window.variance["torque"].mean(axis=0)
-        torque, var = window.torque.mean(axis=0), variance / len(window.t)
-        saturated = _saturated(window, rig, deviations)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            noise = deviations * np.sqrt(var + np.where(self.weight > 0.0, 1.0 / self.weight, np.inf))
+        torque, var = window.torque.mean(axis=0), window.variance["torque"].mean(axis=0) / len(window.t)
+        since = window.t - window.t.mean()
+        with np.errstate(invalid="ignore"):  # a speed or torque that is no number
+            gain = float(since @ window.ground_speed)  # of the ground speed's regression on time
+            noise = deviations * np.sqrt(2.0 * var)
             exceeded, below = torque - self.level > noise, self.level - torque > noise
-            saturated &= self.highest - torque <= deviations * np.sqrt(2.0 * var)
+            saturated = _saturated(window, rig, deviations) & (self.highest - torque <= noise)
         known = np.isfinite(self.level) & ~exceeded
         same = saturated & known & ~below
-        new = np.divide(1.0, var, out=np.zeros_like(var), where=saturated)
-        weight = np.where(known & (same | ~saturated), self.weight, 0.0) + new
-        share = np.divide(new, weight, out=np.zeros_like(weight), where=saturated)
-        level = np.where(known & (same | ~saturated), self.level, np.where(saturated, torque, np.nan))
-        level = np.where(saturated, level + share * (torque - level), level)
-        gain, of_noise = _speed_gained(window, deviations)
+        level = np.where(saturated, torque, np.where(known, self.level, np.nan))
+        of_noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
         lasts = saturated | (self.lasts & known & ~below)
         return replace(
             self,
             highest=np.fmax(self.highest, torque),
             level=level,
-            weight=weight,
             lasts=lasts,
             unmet=lasts & ((self.unmet & (gain < of_noise)) | (saturated & (gain < -of_noise))),
             returned=known & (self.returned | (same & ~self.lasts)),
@@ -132,21 +114,10 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
 
 
 def _trend(since: Array, values: Array, variance: Array | float = 0.0) -> Array:
-    """Slope of each column (N, W) over time (N, 1), as the normal deviate that its Student t has (Wallace 1959).
-
-    The residuals have at least this variance.
-    """
+    """Slope of columns (N, W) over time (N, 1) as normal deviate (Wallace 1959), of residuals with this variance."""
     values, free = values - values.mean(axis=0), len(values) - 2
     spread = float((since**2).sum())
     slope = (since * values).sum(axis=0) / spread
     rest = np.maximum(((values - slope * since) ** 2).sum(axis=0) / free, variance)
     share = (8.0 * free + 1.0) / (8.0 * free + 3.0)
     return np.asarray(share * np.sqrt(free * np.log1p(slope**2 * spread / rest / free)))
-
-
-def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
-    """Ground speed gained over the window (regression on time), and its significance limit; both in m/s * s."""
-    since = window.t - window.t.mean()
-    noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
-    with np.errstate(invalid="ignore"):  # a ground speed that is no number
-        return float(since @ window.ground_speed), noise

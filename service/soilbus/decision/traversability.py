@@ -4,8 +4,8 @@
     P >= go and a valid estimate      go
     otherwise                         caution; unknown without a probability
 
-P is the probability that pull and sinkage stay within their limits (`judgement`); go and no_go are configured.  A worse
-state is in force at once, a better one after several windows beyond a raised threshold (hysteresis):
+P: that pull and sinkage stay within their limits (`judgement`).  A worse state is in force at once, a better one after
+several windows beyond a raised threshold (hysteresis):
 
     raised threshold    p_raised = Phi(Phi^-1(p) + h)        h: `hysteresis` [standard deviations of the margin]
     better state        the last `hold` windows each pass its raised threshold
@@ -24,6 +24,7 @@ from soilbus.config.model import Traversability as Settings
 if TYPE_CHECKING:
     from soilbus.decision.capability import Capability
     from soilbus.estimation.posterior import Estimate
+
 
 __all__ = ["ORDER", "Held", "State", "Status", "Traversability", "doubted", "settled", "state_of"]
 
@@ -56,10 +57,8 @@ class Traversability:
         The decision, and the probability that pull and sinkage stay within their limits.
     torque_required, torque_available
         [N m], sums over the wheels.
-    max_draft
-        [N], on the level.
-    max_grade
-        [rad], without draft.
+    max_draft, max_grade
+        [N] on the level, and [rad] without draft.
     slip_needed
         Slip at which the present demand is met.
     limit
@@ -110,41 +109,24 @@ class Held:
 
 
 def settled(last: Held, probability: float | None, status: Status, settings: Settings) -> Held:
-    """Return the state in force after one more window.
+    """Return the state in force after one more window of this probability (None: unknown) and status.
 
-    Parameters
-    ----------
-    last
-        The state before.
-    probability
-        Of the window's decision; None is unknown.
-    status
-        Of the window.
-    settings
-        Thresholds, `hold` and `hysteresis`.
-
-    Notes
-    -----
     Unknown and worse states take effect at once.  After unknown, any state does.
     """
     if probability is None:
         return Held()
     now, raised = (state_of(probability, status, by) for by in (settings, _raised(settings)))
     recent = (*last.recent, raised)[-settings.hold :]
-    if last.state is State.UNKNOWN or _rank(now) <= _rank(last.state):
+    if last.state is State.UNKNOWN or ORDER.index(now) <= ORDER.index(last.state):
         return Held(now, recent)
-    risen = min(recent, key=_rank) if len(recent) == settings.hold else last.state
-    return Held(max(last.state, risen, key=_rank), recent)
+    risen = min(recent, key=ORDER.index) if len(recent) == settings.hold else last.state
+    return Held(max(last.state, risen, key=ORDER.index), recent)
 
 
 def doubted(last: Held) -> Held:
     """Return the state in force while the ground changes and the new soil is unknown: caution, or still no_go."""
-    state = min(last.state, State.CAUTION, key=_rank) if last.state is not State.UNKNOWN else State.CAUTION
+    state = min(last.state, State.CAUTION, key=ORDER.index) if last.state is not State.UNKNOWN else State.CAUTION
     return Held(state, (state,))
-
-
-def _rank(state: State) -> int:
-    return ORDER.index(state)
 
 
 @lru_cache(maxsize=8)

@@ -3,9 +3,8 @@
     effects      e_i = e + sqrt(lambda_i) v_i             lambda_i, v_i: eigenpairs of the effects' covariance C_ee
     soil         log p_i = log p + C_pe v_i / sqrt(lambda_i)     regression of the soil's logarithms on the effects
 
-A window determines soil and effects jointly: a stronger soil goes with shorter lugs.  So each principal direction of
-the effects' covariance, one standard deviation long, is a model of its own, with the soil that goes with it.  The rest
-of the soil's covariance is independent of the effects.  The model's form (its open structure) is treated alike.
+A window determines soil and effects jointly: a stronger soil goes with shorter lugs.  The rest of the soil's covariance
+is independent of the effects.  The model's form (its open structure) is treated alike.
 """
 
 from __future__ import annotations
@@ -33,22 +32,16 @@ _HELD_VARIANCE = 1e-8
 """Variance, in units of a parameter's prior, below which its direction counts as known exactly."""
 
 
-class PerturbedModel(NamedTuple):
-    """The model one standard deviation away along one direction, and the soil's change (6,), in logarithms, with it."""
-
-    model: CompletedModel
-    shift: Array
-
-
-@dataclass(frozen=True, slots=True)
-class UncertainModel:
+class UncertainModel(NamedTuple):
     """The mean model, and one perturbed model for each independent direction of its uncertainty.
 
-    The last `of_form` of the perturbed models are of the model's form.
+    shifts (Q, 6): changes of the soil's logarithms that go with the Q perturbed models, of which the last `of_form` are
+    of the model's form.
     """
 
     mean: CompletedModel
-    perturbed: tuple[PerturbedModel, ...] = ()
+    perturbed: tuple[CompletedModel, ...] = ()
+    shifts: Array = np.empty((0, _SOIL))
     of_form: int = 0
 
     @classmethod
@@ -63,22 +56,10 @@ class UncertainModel:
     ) -> UncertainModel:  # fmt: skip
         """Return the model with the effects' parameters as a window's posterior has them.
 
-        Parameters
-        ----------
-        model
-            Wheel-soil model without effects.
-        effects, free
-            The effects, and their free parameters.
-        gaussian
-            Posterior of soil and gains; the last len(free) gains are the free parameters in prior standard deviations.
-        n_wheels
-            Number of wheels.
-        ground_speed
-            [m/s], at which effects are evaluated; only those that act in steady driving have a perturbed model.
-        form
-            Posterior of the model's form; None where it is not uncertain.
+        gaussian: posterior of soil and gains, of which the last len(free) are the effects' free parameters in prior
+        standard deviations.  ground_speed [m/s]: of steady driving; only effects that act there have a perturbed model.
+        form: posterior of the model's form, None where it is not uncertain.
         """
-
         centre = np.zeros(len(FORM)) if form is None else form.centre
 
         def at(standardised: Array, step: Array = centre) -> CompletedModel:
@@ -90,56 +71,42 @@ class UncertainModel:
         mean = at(standardised)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
-        of_form = [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, centre + step))
-        if not len(places):
-            return cls(mean, tuple(of_form), len(of_form))
+        models, shifts = [], []
         of_effects = _SOIL + first + places
         variance, axes = np.linalg.eigh(gaussian.covariance[np.ix_(of_effects, of_effects)])
-        perturbed = []
+        low, high = np.array([f.bounds for f in free]).reshape(-1, 2).T
         for size, axis in zip(variance.tolist(), axes.T, strict=True):
             if size <= _HELD_VARIANCE:
                 continue
             step = np.zeros(len(free))
             step[places] = axis * np.sqrt(size)
             shift = gaussian.covariance[:_SOIL, of_effects] @ axis / np.sqrt(size)
-            sign = _sign_inside(free, standardised, step)
-            perturbed.append(PerturbedModel(at(standardised + sign * step), sign * shift))
-        return cls(mean, tuple(perturbed + of_form), len(of_form))
-
-    @property
-    def shifts(self) -> Array:
-        """Changes of the soil's logarithms (Q, 6), one row for each perturbed model."""
-        return np.array([one.shift for one in self.perturbed]).reshape(-1, _SOIL)
+            there, other = (np.abs(np.clip(p, low, high) - p).sum() for p in (standardised + step, standardised - step))
+            sign = 1.0 if there <= other else -1.0  # beyond their ranges the parameters are clipped
+            models.append(at(standardised + sign * step))
+            shifts.append(sign * shift)
+        of_effects_alone = len(models)
+        if form is not None:
+            for step in _form_steps(form):
+                models.append(at(standardised, centre + step))
+                shifts.append(form.by_form[:_SOIL] @ step)
+        return cls(mean, tuple(models), np.array(shifts).reshape(-1, _SOIL), len(models) - of_effects_alone)
 
     def with_form(self, log_covariance: Array) -> Array:
         """Return the covariance (6, 6) of the soil's logarithms: a fit's own plus that due to the model's form."""
-        along = self.shifts[len(self.perturbed) - self.of_form :]
+        along = self.shifts[len(self.shifts) - self.of_form :]
         return np.asarray(log_covariance + along.T @ along)
 
     def of_rows(self, n: int) -> ModelOfRows:
         """Return the models of n rows of soils; the last rows belong to the perturbed models."""
-        known = n - len(self.perturbed)
-        row = np.concatenate([np.zeros(known, int), 1 + np.arange(len(self.perturbed))])
-        return ModelOfRows((self.mean, *[one.model for one in self.perturbed]), row)
+        return ModelOfRows((self.mean, *self.perturbed), np.maximum(np.arange(n) - n + len(self.perturbed) + 1, 0))
 
 
-def _perturbed_by_form(form: FormPosterior, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
-    """A perturbed model for each direction of the form's spread, on the side on which its mean lies."""
+def _form_steps(form: FormPosterior) -> list[Array]:
+    """One sd along each principal direction of the form's spread, on the side on which its mean lies."""
     variance, axes = np.linalg.eigh(form.spread)
     axes = axes * np.where(form.mean @ axes < 0.0, -1.0, 1.0)
-    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T[variance > _HELD_VARIANCE]
-    return [PerturbedModel(at(step), form.by_form[:_SOIL] @ step) for step in steps]
-
-
-def _sign_inside(free: Sequence[Free], standardised: Array, step: Array) -> float:
-    """Sign (1 or -1) of a step (P,) with which the parameters exceed their ranges less; beyond they are clipped."""
-    low, high = np.array([f.bounds for f in free]).reshape(-1, 2).T
-
-    def lost(sign: float) -> float:
-        there = standardised + sign * step
-        return float(np.abs(np.clip(there, low, high) - there).sum())
-
-    return 1.0 if lost(1.0) <= lost(-1.0) else -1.0
+    return [axes[:, i] * np.sqrt(variance[i]) for i in np.flatnonzero(variance > _HELD_VARIANCE)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,11 +115,6 @@ class ModelOfRows:
 
     models: tuple[CompletedModel, ...]
     row: NDArray[np.intp]
-
-    @property
-    def first(self) -> CompletedModel:
-        """The model of the first row."""
-        return self.models[int(self.row[0])]
 
     def of(self, rows: NDArray[np.intp]) -> ModelOfRows:
         """Return the models of some of the rows."""
@@ -178,11 +140,11 @@ class ModelOfRows:
     def angle_of_sinkage(self, depth: float, wheel: Wheel) -> Array:
         """Return the entry angle [rad] (D, A) at which wheels (A,) have this sinkage [m]."""
         shape = (len(self.row), *np.shape(wheel.radius))
-        return self._by_model(
-            lambda model, at: np.broadcast_to(
-                model.angle_of_sinkage(depth, wheel), (len(self.row[at]), *shape[1:])
-            ), shape,
-        )  # fmt: skip
+
+        def rows(model: CompletedModel, at: _Rows) -> Array:
+            return np.broadcast_to(model.angle_of_sinkage(depth, wheel), (len(self.row[at]), *shape[1:]))
+
+        return self._by_model(rows, shape)
 
     def _by_model(self, rows: Callable[[CompletedModel, _Rows], Array], shape: tuple[int, ...], axis: int = 0) -> Array:
         """An array of this shape, filled by each model for its rows, which lie along `axis`."""

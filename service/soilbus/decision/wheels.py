@@ -30,8 +30,7 @@ from soilbus.terra.wheel import MAX_ENTRY_ANGLE, WheelModel, WheelState
 NEWTON_TOLERANCE = 1e-3
 """Step of pull and load, as a share of the weight, below which Newton's method stops; it leaves some 1e-6."""
 RELATIVE_REGULARISATION = 1e-6
-"""Ridge term of the regression on the soils' logarithms, as a share of their total sum of squares: directions with a
-smaller spread do not determine how pull and angles change."""
+"""Ridge term of the regression on the soils' logarithms, as a share of their total sum of squares."""
 LEAST_POSITIVE = 1e-12
 """Lower bound of a soil parameter before its logarithm is taken, and of the ridge term."""
 MAX_NEWTON_STEPS = 12
@@ -47,22 +46,10 @@ LOAD_RATIO = 0.9
 class Axles:
     """The A kinds of wheels: those alike in axle, radius, width, contact length and whether they are driven.
 
-    Attributes
-    ----------
-    chassis
-        Mass and geometry of the vehicle.
-    radius, width
-        (A, 1) [m].
-    front, driven, count
-        (A, 1), whether on the front axle, whether driven, and how many.
-    level, tilt, lever
-        (A, 1) [N], [N] and [1]: load of a wheel = level * cosine + tilt * sine of the slope + lever * draft.
-    of_wheel
-        (W,), kind of each wheel.
-    shared_motors
-        Of several wheels.
-    length
-        (A, 1) [m], of tracks; the number 0 where all are wheels.
+    radius, width (A, 1) [m].  front, driven, count (A, 1): whether on the front axle, whether driven, and how many.
+    level, tilt [N], lever [1] (A, 1): load of a wheel = level * cosine + tilt * sine of the slope + lever * draft.
+    of_wheel (W,): kind of each wheel.  shared_motors: of several wheels.  length (A, 1) [m]: of tracks; the number 0
+    where all are wheels.
     """
 
     chassis: Chassis
@@ -78,27 +65,9 @@ class Axles:
     shared_motors: tuple[Group, ...] = ()
     length: Array | float = 0.0
 
-    @property
-    def drives(self) -> NDArray[np.bool_]:
-        """Which wheels are driven (W,)."""
-        return np.asarray(self.driven[self.of_wheel, 0])
-
     @classmethod
     def of(cls, rig: Rig, drives: NDArray[np.bool_]) -> Axles:
-        """Return the kinds of a rig's wheels.
-
-        Parameters
-        ----------
-        rig
-            The vehicle's wheels and chassis.
-        drives
-            (W,), which wheels are driven.
-
-        Raises
-        ------
-        ValueError
-            For a rig without a chassis.
-        """
+        """Return the kinds of a rig's wheels, of which some drive (W,); ValueError for a rig without a chassis."""
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
         lengths = np.zeros(len(drives)) if rig.lengths is None else rig.lengths
@@ -138,26 +107,11 @@ class Axles:
 class WheelTable:
     """Steady states on the level of D soils, A kinds of wheels, S slips.
 
-    Attributes
-    ----------
-    axles
-        The kinds of wheels.
-    soils
-        (D, 6).
-    slip
-        (S,), of the driven wheels.
-    pull
-        (D, S) [N], of the vehicle; nan where not balanced.
-    load
-        (D, A, S) [N], of one wheel.
-    at
-        (3, D, A, S), drawbar pull [N], torque [N m] and entry angle [rad] of one wheel.
-    by_load, by_slip
-        (3, D, A, S), derivatives of `at` by its load at constant slip and by slip at constant load.
-    half_second_derivative
-        (3, 1, A, S), half the second derivative of `at` by load, of the first soil and used for all.
-    balanced
-        (D, S), whether a steady state was found.
+    soils (D, 6).  slip (S,): of the driven wheels.  pull (D, S) [N]: of the vehicle, nan where not balanced.  load (D,
+    A, S) [N]: of one wheel.  at, by_load, by_slip (3, D, A, S): drawbar pull [N], torque [N m] and entry angle [rad] of
+    one wheel, and their derivatives by its load at constant slip and by slip at constant load.  half_second_derivative
+    (3, 1, A, S): half of that of `at` by load, of the first soil and used for all.  balanced (D, S): whether a steady
+    state was found.
     """
 
     axles: Axles
@@ -171,17 +125,10 @@ class WheelTable:
     half_second_derivative: Array
     balanced: NDArray[np.bool_]
 
-    def pull_at(self, load: Array) -> Array:
-        """Return the pull of the vehicle [N] (..., D, S) with its wheels at other loads (..., D, A, S)."""
+    def change_at(self, load: Array) -> Array:
+        """Return the changes of drawbar pulls, torques and entry angles (3, D, A, S) at other loads (D, A, S)."""
         change = load - self.load
-        drawbar = self.at[DRAWBAR] + change * (self.by_load[DRAWBAR] + self.half_second_derivative[DRAWBAR] * change)
-        return np.asarray((self.axles.count * drawbar).sum(axis=-2))
-
-    def change_at(self, load: Array) -> list[Array]:
-        """Return the changes of drawbar pull, torque and entry angle (..., D, A, S) at other loads (..., D, A, S)."""
-        change = load - self.load
-        derivatives = zip(self.by_load, self.half_second_derivative, strict=True)
-        return [change * (first + half_second * change) for first, half_second in derivatives]
+        return np.asarray(change * (self.by_load + self.half_second_derivative * change))
 
 
 def wheel_table(
@@ -195,27 +142,9 @@ def wheel_table(
 ) -> WheelTable:
     """Return the steady level driving on D soils at S slips.
 
-    Parameters
-    ----------
-    soils
-        (D, 6).  The last of them belong to the perturbed models of an uncertain model.
-    rig
-        With a chassis.
-    model
-        The wheel-soil model.
-    slip
-        (S,), of the driven wheels.
-    start
-        Table of the same rig on similar soils, to start Newton's method from.
-    tolerance
-        Step of pull and load, as a share of the weight, below which Newton's method stops.
-    driven
-        (W,), which wheels are driven; None for all.
-
-    Raises
-    ------
-    ValueError
-        For a rig without a chassis.
+    soils (D, 6): the last belong to the perturbed models of an uncertain model.  slip (S,): of the driven wheels.  rig:
+    with a chassis, else ValueError.  start: table of the same rig on similar soils.  tolerance: step of pull and load,
+    as a share of the weight, below which Newton's method stops.  driven (W,): which wheels are driven; None for all.
     """
     n_soils, n_slips = len(soils), len(slip)
     completed = UncertainModel.over(model).of_rows(n_soils)
@@ -223,11 +152,10 @@ def wheel_table(
     if start is not None and not (
         start.pull.shape == (n_soils, n_slips)
         and np.array_equal(start.slip, slip)
-        and np.array_equal(start.axles.drives, drives)
+        and np.array_equal(start.axles.driven[start.axles.of_wheel, 0], drives)
     ):
         start = None
-    is_same = start is not None and start.axles.chassis == rig.chassis
-    axles = start.axles if start is not None and is_same else Axles.of(rig, drives)
+    axles = start.axles if start is not None and start.axles.chassis == rig.chassis else Axles.of(rig, drives)
     options = rig.options.measurements
     # a track without thrust does not slip
     rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, options.rolling_slip)
@@ -242,7 +170,7 @@ def wheel_table(
     unknown = np.isnan(angle).any(axis=(1, 2))
     if unknown.any():
         guess = _state(soils[unknown], axles, slips[unknown], angle[unknown])
-        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.first.model, tolerance=1e-2)
+        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.models[0].model, tolerance=1e-2)
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
         now = _newton_step(soils, axles, completed, slips, pull, load, angle, options.max_rolling_skid)
@@ -251,25 +179,17 @@ def wheel_table(
             if not len(rows):
                 break
             angle[rows] = np.clip(now.at[ANGLE, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
-            of_rows = (
-                soils[rows],
-                axles,
-                completed.of(rows),
-                now.slip[rows],
-                now.pull[rows],
-                now.load[rows],
-                angle[rows],
-                options.max_rolling_skid,
-            )
-            for whole, part in zip(now, _newton_step(*of_rows), strict=True):
+            at_rows = now.slip[rows], now.pull[rows], now.load[rows], angle[rows]
+            step = _newton_step(soils[rows], axles, completed.of(rows), *at_rows, options.max_rolling_skid)
+            for whole, part in zip(now, step, strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
     pull, load, at, by_load, by_slip, slips, step_size = now
     balanced = np.isfinite(at[ANGLE]).all(axis=1) & (load > 0.0).all(axis=1) & (step_size <= last_step)
-    of_first = soils[:1], axles, completed.first, slips[:1], load[:1], at[:, :1], by_load[:, :1]
-    half_second = _half_second_derivative(*of_first)
-    return WheelTable(
-        axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, half_second, balanced
+    half_second = _half_second_derivative(
+        soils[:1], axles, completed.models[0], slips[:1], load[:1], at[:, :1], by_load[:, :1]
     )
+    pull = np.where(balanced, pull, np.nan)
+    return WheelTable(axles, soils, slip, pull, load, at, by_load, by_slip, half_second, balanced)
 
 
 def _extrapolated(start: WheelTable, soils: Array) -> tuple[Array, Array]:
@@ -299,20 +219,9 @@ class _Step(NamedTuple):
 
 
 def _newton_step(
-    soils: Array,
-    axles: Axles,
-    model: ModelOfRows,
-    slip: Array,
-    pull: Array,
-    load: Array,
-    angle: Array,
-    max_skid: float,
+    soils: Array, axles: Axles, model: ModelOfRows, slip: Array, pull: Array, load: Array, angle: Array, max_skid: float
 ) -> _Step:
-    """One Newton step of entry angles, loads and pull.
-
-    A wheel that is not driven has torque T = 0, which is solved for its slip; so its slip follows its load; it skids by
-    `max_skid` at most.
-    """
+    """One Newton step of entry angles, loads and pull; a wheel that is not driven skids to torque 0, within a limit."""
     forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)
     by_carried = np.stack([d.by_angle[1], d.by_angle[2], np.ones_like(d.by_angle[0])]) / d.by_angle[0]
     by_load = by_carried * (1.0 - d.by_load[0])

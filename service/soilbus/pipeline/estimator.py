@@ -21,14 +21,13 @@ from soilbus.allocator import keep_freed_memory
 from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
-from soilbus.decision.driveline import disengaged, idle, shared_out
+from soilbus.decision.driveline import idle, on_shaft, shared_out
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.moments import bins_of_a_moment, moments
-from soilbus.decision.options import WATCH
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traversability import Held, State, Status, Traversability, doubted, settled
 from soilbus.decision.uncertain_model import UncertainModel
-from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
+from soilbus.decision.watch import Alert, Warnings, Watch, curve_age, ended, watched
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of, with_disengaged
 from soilbus.estimation.gaussian import Gaussian
@@ -117,7 +116,7 @@ class WindowEstimator:
         self._valid_at: float | None = None
         self._watch, self._warnings = Watch(), Warnings()
         self._curve: tuple[OverSlip | None, float] = None, -np.inf
-        self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._idle, self._on_shaft = np.zeros(len(self.rig.wheels), bool), on_shaft(self.rig)
         self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._class_prior = guessed(self.prior, prior_of(Config()))
@@ -143,7 +142,8 @@ class WindowEstimator:
     def _follow_clutch(self, task: WindowTask) -> Window:
         """The data after the hop in which an axle was engaged or disengaged; the tracker is of the machine now."""
         since = -math.inf if task.fresh else task.end - self._settings.hop
-        apart = disengaged(task.window, self.rig, since, self._apart)
+        self._idle = idle(task.window, self.rig, since, self._apart if task.fresh else self._idle)
+        apart = self._idle & self._on_shaft
         if (apart != self._apart).any():
             self._apart, self._engaged_at = apart, task.end
             self._driven_rig = with_disengaged(self.config, self.rig, apart)
@@ -276,8 +276,7 @@ class WindowEstimator:
         """Corrections.torque_ceiling; window: the task's, with its draft corrected."""
         hop, deviations = self._settings.hop, self.config.traversability.contradiction
         if task.fresh:
-            self._idle, self._ceiling = np.zeros_like(self._idle), TorqueCeiling.unknown(len(self._idle))
-        self._idle = idle(task.window, self.rig, task.end - hop, self._idle)
+            self._ceiling = TorqueCeiling.unknown(len(self._idle))
         self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
         measured = np.where(np.isfinite(self._ceiling.limit), self._ceiling.limit, np.inf)
         return tuple(np.where(self._idle, 0.0, measured).tolist())
@@ -301,7 +300,7 @@ class WindowEstimator:
         bins = bins_of_a_moment(settings.bin)
         for moment in moments(driven, self.rig, window.torque_limit, self.config, chosen, bins):
             curve, t = self._curve
-            known = curve if moment.t - t < WATCH.curve_age else None
+            known = curve if moment.t - t < curve_age(self.config) else None
             self._watch = watched(self._watch, moment, known, self.config)
             self._warnings = self._warnings.after(moment.t, self._watch.warning)
 
