@@ -36,58 +36,66 @@ if TYPE_CHECKING:
 
 def replay(args: argparse.Namespace) -> None:
     """Run `soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
+    from soilbus.offline.replay import LogError
+    from soilbus.report.advice import of_use
+    from soilbus.report.windows import why_of_no_use
+
+    config = configured(args)
+    _check_files(args, config)
+    try:
+        results, text = (_replay_logs if config.table is None else _replay_tables)(args, config)
+    except LogError as error:
+        raise WorkError(str(error)) from None
+    _write_windows(args, config, results, text)
+    drive = "" if config.table is not None else _what_to_drive(args, config, results)
+    if "-" not in (str(args.json), str(args.map)):
+        print(text + drive, end="")
+    if not of_use(results):
+        raise WorkError(why_of_no_use(results, config.estimator.window))
+    if args.manoeuvre_out is not None and not drive:
+        raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
+
+
+def _replay_logs(args: argparse.Namespace, config: Config) -> tuple[list[WindowResult], str]:
+    """The windows of logs and their summary."""
     with loading():
         from soilbus.can.dbc_files import load_databases
-        from soilbus.config.model import ConfigError
         from soilbus.offline.replay import LogError, channel_notes, estimator_beside, replay
         from soilbus.pipeline.pipeline import Pipeline
         from soilbus.report.progress import progress
         from soilbus.report.windows import summary
 
-    config = configured(args)
-    _check_files(args, config)
-    if args.frames is not None and "-" in map(str, args.logs):
-        raise ConfigError(["--frames reads each log again, which standard input cannot be"])
-    if config.table is not None:
-        if args.frames is not None:
-            raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
-        if args.manoeuvre_out is not None:
-            raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
-        _replay_tables(args, config)
-        return
     for line in channel_notes(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
-    results: list[WindowResult] = []
     faults: list[LogError] = []
     with estimator_beside(config) as workers, progress("replay") as step:
         try:
-            results.extend(replay(pipeline, args.logs, step, workers, faults.append if args.partial else None))
+            results = list(replay(pipeline, args.logs, step, workers, faults.append if args.partial else None))
         except LogError as error:
-            kept = [f"the {error.windows} windows before"] * (error.windows > 0) + ["the other logs"] * (
-                len(args.logs) > 1
-            )
-            hint = f"; --partial keeps {' and '.join(kept)}" if kept else ""
-            raise WorkError(f"{error}{hint}") from None
+            kept = ["the other logs"] * (len(args.logs) > 1)
+            if error.windows:
+                kept.insert(0, f"the {error.windows} windows before")
+            raise WorkError(f"{error}; --partial keeps {' and '.join(kept)}" if kept else str(error)) from None
     for fault in faults:
         say(f"{fault}; {fault.windows} windows before that are kept")
-    text = summary(results, pipeline)
-    _write_windows(args, config, results, text)
-    if args.frames is not None:
-        _write_frames(args, config)
-    drive = _what_to_drive(args, config, results)
-    if "-" not in (str(args.json), str(args.map)):
-        print(text + drive, end="")
-    _need_a_use(results, config)
-    if args.manoeuvre_out is not None and not drive:
-        raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
+    return results, summary(results, pipeline)
+
+
+def _replay_tables(args: argparse.Namespace, config: Config) -> tuple[list[WindowResult], str]:
+    """The windows of a test rig's tables and their summary."""
+    from collections import Counter
+
+    from soilbus.offline.tables import replay_tables
+    from soilbus.report.windows import summary_of
+
+    results = list(replay_tables(config, args.logs))
+    refused = sum((Counter(result.rejected) for result in results), Counter[str]())
+    return results, summary_of(results, f"{len(args.logs)} tables", None, refused)
 
 
 def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[WindowResult]) -> str:
-    """Where most windows are not excited, or on demand, what to drive to know the soil better: lines for the summary.
-
-    Written where --manoeuvre-out says.
-    """
+    """What to drive to know the soil better, where most windows are not excited or --manoeuvre-out asks for it."""
     import json
 
     from soilbus.report.advice import of_use
@@ -109,43 +117,9 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     return "\n".join(excitation_lines(*found, now, config)) + "\n"
 
 
-def _write_frames(args: argparse.Namespace, config: Config) -> None:
-    from soilbus.can.log_writer import write_log
-    from soilbus.offline.sent_frames import sent_frames
-
-    with reading_or_writing(args.frames):
-        write_log(sent_frames(config, args.logs), args.frames)
-
-
-def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
-    from soilbus.report.advice import of_use
-    from soilbus.report.windows import why_of_no_use
-
-    if not of_use(results):
-        raise WorkError(why_of_no_use(results, config.estimator.window))
-
-
-def _replay_tables(args: argparse.Namespace, config: Config) -> None:
-    from collections import Counter
-
-    from soilbus.offline.replay import LogError
-    from soilbus.offline.tables import replay_tables
-    from soilbus.report.windows import summary_of
-
-    try:
-        results = list(replay_tables(config, args.logs))
-    except LogError as error:
-        raise WorkError(str(error)) from None
-    refused = sum((Counter(result.rejected) for result in results), Counter[str]())
-    text = summary_of(results, f"{len(args.logs)} tables", None, refused)
-    _write_windows(args, config, results, text)
-    if str(args.json) != "-":
-        print(text, end="")
-    _need_a_use(results, config)
-
-
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
     """What the options for files ask for, under a summary."""
+    from soilbus.can.log_writer import write_log
     from soilbus.export.geopackage import write_geopackage
     from soilbus.export.mcap_log import write_mcap
     from soilbus.export.soil_map import soil_map
@@ -167,14 +141,16 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
         write_mcap(args.mcap, results, config, _frames_read(args, config))
     if args.map is not None:
         map_text, left_out = soil_map(results)
-        if args.map.suffix == ".gpkg":
-            write_geopackage(args.map, map_text)
-        else:
-            write_text(args.map, map_text)
+        (write_geopackage if args.map.suffix == ".gpkg" else write_text)(args.map, map_text)
         if left_out:
             say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
         say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
+    if args.frames is not None:
+        from soilbus.offline.sent_frames import sent_frames
+
+        with reading_or_writing(args.frames):
+            write_log(sent_frames(config, args.logs), args.frames)
 
 
 def _frames_read(args: argparse.Namespace, config: Config) -> Iterator[tuple[str, Frame]]:
@@ -194,6 +170,7 @@ def _frames_read(args: argparse.Namespace, config: Config) -> Iterator[tuple[str
 
 def _check_files(args: argparse.Namespace, config: Config) -> None:
     """Ask before the work whether what the options for files need is there."""
+    from soilbus.config.model import ConfigError
     from soilbus.export.soil_map import check_position_is_mapped
 
     for path, option in ((args.map, "--map"), (args.isoxml, "--isoxml")):
@@ -210,6 +187,12 @@ def _check_files(args: argparse.Namespace, config: Config) -> None:
     check_log_to_write(args.frames)
     written = args.json, args.report, args.table, args.mcap, args.map, args.frames, args.manoeuvre_out
     check_outputs(*written, read=_read_files(args, config))
+    if args.frames is not None and "-" in map(str, args.logs):
+        raise ConfigError(["--frames reads each log again, which standard input cannot be"])
+    if args.frames is not None and config.table is not None:
+        raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
+    if args.manoeuvre_out is not None and config.table is not None:
+        raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
 
 
 def _read_files(args: argparse.Namespace, config: Config) -> list[Path]:

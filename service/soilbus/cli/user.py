@@ -242,12 +242,21 @@ def completion(args: argparse.Namespace) -> None:
 
 
 def docs(args: argparse.Namespace) -> None:
-    """Run `soilbus docs`: the pages that came with this version."""
-    from soilbus.cli.docs import overview, pages
+    """Run `soilbus docs`: the pages of this version, and the README of `dbc` and of `systemd`."""
     from soilbus.config.model import ConfigError
     from soilbus.words import did_you_mean
 
-    found = pages()
-    if args.page is not None and args.page not in found:
+    package = Path(__file__).resolve().parents[1]
+    places = package, package.parent, package.parents[1]  # installed; or a checkout's folders
+    folders = {name: next(p / name for p in places if (p / name).is_dir()) for name in ("docs", "dbc", "systemd")}
+    found = {path.stem: path for path in sorted(folders["docs"].glob("*.md"))}
+    found |= {name: folders[name] / "README.md" for name in ("dbc", "systemd")}
+    if args.page in found:
+        print(found[args.page].read_text(encoding="utf-8"), end="")
+        return
+    if args.page is not None:
         raise ConfigError([f"no page {args.page}{did_you_mean(args.page, found)}"])
-    print(found[args.page].read_text(encoding="utf-8") if args.page else overview(), end="")
+    for name, path in found.items():
+        lines = path.read_text(encoding="utf-8").splitlines()
+        print(f"{name:16}{next(line.removeprefix('# ') for line in lines if line.startswith('# '))}")
+    print(f"\nsoilbus docs PAGE prints one; they lie in {folders['docs']}")

@@ -3,7 +3,7 @@
 Each page is a pure function of what it describes (the model of the configuration, the parser of the command line, the
 catalogue of effects), and a test compares the pages in `service/docs` with it.
 
-    python -m soilbus.cli.reference service/docs     writes them again
+    python tests/support/reference_pages.py service/docs     writes them again
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from soilbus.terra.effects.effect import Effect
 
 VALUES = (Signal, Noise, Prior, Column, EffectTable)
 """Sections that are values of many keys."""
-GENERATED = "<!-- generated: python -m soilbus.cli.reference service/docs -->\n\n"
+GENERATED = "<!-- generated: python tests/support/reference_pages.py service/docs -->\n\n"
 
 
 def pages() -> dict[str, str]:
