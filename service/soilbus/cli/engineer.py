@@ -1,18 +1,24 @@
-"""Commands of the controls engineer: replay, simulate, diagnose, effects, batch.
+"""Commands of the controls engineer: replay, simulate, diagnose, batch.
 
-Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
+Each function takes the parsed arguments, does the work and writes the outputs asked for.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import time
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soilbus.allocator import loading
+from soilbus.can.bus import BusError
+from soilbus.can.candump import Frame
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.cli.common import (
     WorkError,
     check_log_to_write,
@@ -21,25 +27,28 @@ from soilbus.cli.common import (
     configured_or_reference,
     need_extra,
     reading_or_writing,
-    report,
 )
-from soilbus.files import whole_file, write_text
+from soilbus.config.edit import with_effects_text
+from soilbus.config.file import found_configuration, load_config
+from soilbus.config.model import Config, ConfigError
+from soilbus.files import read_bounded, whole_file, write_text
+from soilbus.offline.replay import LogError, channel_notes, estimator_beside, log_of
+from soilbus.offline.replay import replay as replay_logs
+from soilbus.pipeline.outputs import json_line
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.process import say
+from soilbus.report.advice import of_use
+from soilbus.report.page import Source
+from soilbus.report.progress import phases, progress
+from soilbus.report.windows import summary, summary_of, why_of_no_use
 
 if TYPE_CHECKING:
-    from soilbus.can.candump import Frame
-    from soilbus.config.model import Config
-    from soilbus.pipeline.result import WindowResult
-    from soilbus.report.page import Source
     from soilbus.simulator.scenario import Scenario
 
 
 def replay(args: argparse.Namespace) -> None:
     """Run `soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
-    from soilbus.offline.replay import LogError
-    from soilbus.report.advice import of_use
-    from soilbus.report.windows import why_of_no_use
-
     config = configured(args)
     _check_files(args, config)
     try:
@@ -58,20 +67,13 @@ def replay(args: argparse.Namespace) -> None:
 
 def _replay_logs(args: argparse.Namespace, config: Config) -> tuple[list[WindowResult], str]:
     """The windows of logs and their summary."""
-    with loading():
-        from soilbus.can.dbc_files import load_databases
-        from soilbus.offline.replay import LogError, channel_notes, estimator_beside, replay
-        from soilbus.pipeline.pipeline import Pipeline
-        from soilbus.report.progress import progress
-        from soilbus.report.windows import summary
-
     for line in channel_notes(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
     faults: list[LogError] = []
     with estimator_beside(config) as workers, progress("replay") as step:
         try:
-            results = list(replay(pipeline, args.logs, step, workers, faults.append if args.partial else None))
+            results = list(replay_logs(pipeline, args.logs, step, workers, faults.append if args.partial else None))
         except LogError as error:
             kept = ["the other logs"] * (len(args.logs) > 1)
             if error.windows:
@@ -84,10 +86,7 @@ def _replay_logs(args: argparse.Namespace, config: Config) -> tuple[list[WindowR
 
 def _replay_tables(args: argparse.Namespace, config: Config) -> tuple[list[WindowResult], str]:
     """The windows of a test rig's tables and their summary."""
-    from collections import Counter
-
     from soilbus.offline.tables import replay_tables
-    from soilbus.report.windows import summary_of
 
     results = list(replay_tables(config, args.logs))
     refused = sum((Counter(result.rejected) for result in results), Counter[str]())
@@ -96,10 +95,6 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> tuple[list[Windo
 
 def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[WindowResult]) -> str:
     """What to drive to know the soil better, where most windows are not excited or --manoeuvre-out asks for it."""
-    import json
-
-    from soilbus.report.advice import of_use
-
     useful = of_use(results)
     weak = sum(result.reason.startswith("not_excited") for result in useful)
     if not useful or (args.manoeuvre_out is None and 2 * weak < len(useful)):
@@ -119,13 +114,11 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
     """What the options for files ask for, under a summary."""
-    from soilbus.can.log_writer import write_log
     from soilbus.export.geopackage import write_geopackage
     from soilbus.export.mcap_log import write_mcap
     from soilbus.export.soil_map import soil_map
     from soilbus.export.table import write_table
     from soilbus.export.task_data import write_task_data
-    from soilbus.pipeline.outputs import json_line
 
     if args.json is not None:
         with whole_file(args.json) as out:
@@ -155,8 +148,6 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
 
 def _frames_read(args: argparse.Namespace, config: Config) -> Iterator[tuple[str, Frame]]:
     """The frames of the logs with their channels, read again; none of tables and of standard input."""
-    from soilbus.offline.replay import LogError, log_of
-
     if config.columns is not None or config.table is not None:
         return
     if "-" in map(str, args.logs):
@@ -170,7 +161,6 @@ def _frames_read(args: argparse.Namespace, config: Config) -> Iterator[tuple[str
 
 def _check_files(args: argparse.Namespace, config: Config) -> None:
     """Ask before the work whether what the options for files need is there."""
-    from soilbus.config.model import ConfigError
     from soilbus.export.soil_map import check_position_is_mapped
 
     for path, option in ((args.map, "--map"), (args.isoxml, "--isoxml")):
@@ -197,8 +187,6 @@ def _check_files(args: argparse.Namespace, config: Config) -> None:
 
 def _read_files(args: argparse.Namespace, config: Config) -> list[Path]:
     """What replay and diagnose read: logs, configuration and DBCs."""
-    from soilbus.config.file import found_configuration
-
     return [*args.logs, Path(found_configuration(args.config)), *map(Path, config.dbc.input)]
 
 
@@ -210,18 +198,15 @@ def _need_plots() -> None:
 
 def _source(args: argparse.Namespace, config: Config) -> Source:
     """What a report is made from."""
-    from soilbus.config.file import found_configuration
-    from soilbus.report.page import Source
-
     return Source(config, found_configuration(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
     """Run `soilbus simulate`: the simulated tractor, to a bus or a log."""
-    from soilbus.can.bus import BusError
     from soilbus.estimation.assembly import with_effects
     from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
+    from soilbus.simulator.manoeuvre import LARGEST, of_json
     from soilbus.simulator.play import scenario_over
 
     check_log_to_write(args.log)
@@ -239,7 +224,9 @@ def simulate(args: argparse.Namespace) -> None:
         if args.manoeuvre is not None:
             if args.draft is not None or args.slope or args.speed is not None:
                 raise ValueError("--manoeuvre has its own pull, slopes and speeds: leave out --draft, --slope, --speed")
-            scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
+            with reading_or_writing(args.manoeuvre):
+                manoeuvre = of_json(read_bounded(args.manoeuvre, LARGEST).decode())
+            scenario = manoeuvre.over(scenario, config.tows_nothing)
         bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
     except (SimulationError, KeyError, ValueError, BusError) as error:
         raise WorkError(str(error.args[0])) from None
@@ -247,29 +234,16 @@ def simulate(args: argparse.Namespace) -> None:
         say(f"the tractor is stuck after {bogged_at:.1f} s")
 
 
-def _of_manoeuvre(path: Path, scenario: Scenario, config: Config) -> Scenario:
-    """The scenario's soils and vehicle, driven as a manoeuvre says."""
-    from soilbus.files import read_bounded
-    from soilbus.simulator.manoeuvre import LARGEST, of_json
-
-    with reading_or_writing(path):
-        manoeuvre = of_json(read_bounded(path, LARGEST).decode())
-    return manoeuvre.over(scenario, config.tows_nothing)
-
-
 def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
     """Write the log; when the tractor bogged down [s]."""
-    from soilbus.can.log_writer import write_log
     from soilbus.simulator.drive import drive
     from soilbus.simulator.frames import START_TIME, frames
     from soilbus.simulator.recording import recorded
     from soilbus.simulator.truth import write_truth
 
     done = drive(config, scenario, args.seed)
-    try:
+    with reading_or_writing(args.log):
         write_log(frames(recorded(done, config, scenario, args.seed), config), args.log)
-    except OSError as error:
-        raise WorkError(f"{args.log}: {error.strerror or error}") from None
     if args.truth is not None:
         write_truth(done, args.truth, START_TIME)
     return done.bogged_at
@@ -277,9 +251,6 @@ def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) 
 
 def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
     """Drive on the bus; when the tractor bogged down [s]. An interrupted drive leaves its true values too."""
-    import time
-    from collections import deque
-
     from soilbus.simulator.drive import Drive, joined
     from soilbus.simulator.live import drive_live
     from soilbus.simulator.truth import write_truth
@@ -294,33 +265,13 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
     return driven[-1].bogged_at
 
 
-def effects(args: argparse.Namespace) -> None:
-    """Run `soilbus effects`: the catalogue."""
-    from soilbus.cli.effects import effect_records, effect_text, overview
-    from soilbus.config.model import ConfigError
-    from soilbus.terra.effects.catalogue import CATALOGUE
-    from soilbus.words import did_you_mean
-
-    if args.name is not None and args.name not in CATALOGUE:
-        raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
-    wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
-    report(args.json, effect_records(wanted), effect_text(wanted[0]) if args.name else overview(wanted))
-
-
 def diagnose(args: argparse.Namespace) -> None:
     """Run `soilbus diagnose`: find, name, add, show, and say what to drive next."""
-    import json
-
-    from soilbus.config.edit import with_effects_text
-    from soilbus.config.file import found_configuration
-    from soilbus.config.model import ConfigError
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
-    from soilbus.offline.replay import LogError, channel_notes
     from soilbus.report.findings import findings_json, findings_text
-    from soilbus.report.progress import phases
 
     config = configured(args)
     if config.table is not None and args.manoeuvre_out is not None:
@@ -357,7 +308,6 @@ def diagnose(args: argparse.Namespace) -> None:
 
 def batch(args: argparse.Namespace) -> None:
     """Run `soilbus batch`: many logs, on all cores or on a Dask cluster."""
-    from soilbus.config.file import found_configuration, load_config
 
     def own(path: Path) -> Config:
         return load_config(found_configuration(str(path)), args.set).model_copy(update={"log_channel": args.channel})
@@ -369,7 +319,6 @@ def batch(args: argparse.Namespace) -> None:
     from soilbus.offline.cluster import BatchError, cluster
     from soilbus.offline.jobs import jobs_of
     from soilbus.report.batch import batch_text
-    from soilbus.report.progress import phases
 
     check_outputs(args.out)
     check_out(args.out, args.resume or args.retry)

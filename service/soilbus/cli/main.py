@@ -20,7 +20,8 @@ DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = {
     "user": ("demo", "init", "run", "check", "watch", "completion", "docs"),
-    "engineer": ("replay", "simulate", "diagnose", "effects", "batch"),
+    "engineer": ("replay", "simulate", "diagnose", "batch"),
+    "effects": ("effects",),
     "trials": ("paper", "decisions", "bench"),
 }
 """Each file of commands, loaded when one of them is asked for; a command is the function of that name."""
@@ -35,8 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with loading():
         from soilbus.config.model import ConfigError
     try:
-        file = next(file for file, commands in COMMANDS.items() if args.command in commands)
-        getattr(import_module(f"soilbus.cli.{file}"), args.command)(args)
+        with loading():
+            file = next(file for file, commands in COMMANDS.items() if args.command in commands)
+            module = import_module(f"soilbus.cli.{file}")
+        getattr(module, args.command)(args)
         sys.stdout.flush()
     except ConfigError as error:
         for fault in error.faults:
