@@ -5,7 +5,6 @@ All readings are of held-out blocks, which the model was not fitted to.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -167,25 +166,20 @@ def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
 
 
 def _bars(
-    axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Sequence[str],
+    axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Mapping[str, Sequence[str]],
     sd: Mapping[str, Sequence[float]] | None = None,
 ) -> list[Any]:  # fmt: skip
     """Draw groups of horizontal bars, before above after, each with a label at its end; returns one for each look."""
-    words = iter(labels)
     drawn = []
     for i, (when, sizes) in enumerate(bars.items()):
         colour, hatch = LOOKS[when] if len(bars) > 1 else LOOKS["after"]
         y = np.arange(len(sizes)) + (i - (len(bars) - 1) / 2.0) * height
         error = {} if sd is None else {"xerr": 2.0 * np.array(sd[when]), "capsize": 3}
-        drawn.append(
-            axis.barh(y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error)
+        bar = axis.barh(
+            y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error
         )
-        spread = [0.0] * len(sizes) if sd is None else sd[when]
-        for place, size, std in zip(y, sizes, spread, strict=True):
-            axis.annotate(
-                next(words), (np.nan_to_num(size + 2.0 * std), place), (5, 0), textcoords="offset points", va="center",
-                fontsize=10, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
-            )  # fmt: skip
+        axis.bar_label(bar, labels[when], padding=5, fontsize=10)
+        drawn.append(bar)
     axis.invert_yaxis()
     axis.set_xlim(min(0.0, axis.get_xlim()[0]), 1.16 * axis.get_xlim()[1])
     axis.grid(axis="y", visible=False)
@@ -197,7 +191,7 @@ def _draw_gaps(figure: Any, bars: Mapping[str, Mapping[str, float]]) -> None:
     channels = list(bars["before"])
     noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
     sizes = {when: list(of.values()) for when, of in bars.items()}
-    labels = [f"{size:.2f}" for of in sizes.values() for size in of]
+    labels = {when: [f"{size:.2f}" for size in of] for when, of in sizes.items()}
     drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
     axis.set_yticks(range(len(channels)), channels)
     axis.set_xlabel("model’s error, × noise of the sensors")
@@ -234,11 +228,12 @@ def _draw_drafts(
     figure: Any, names: Sequence[str], bars: Mapping[str, Sequence[Estimate | None]], pulled: Sequence[Array]
 ) -> None:
     axis = figure.subplots()
-    none = Estimate(math.nan, math.nan)
+    none = Estimate(0.0, 0.0)
     sizes, sds = (
         {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()} for part in ("value", "std")
     )
-    drawn = _bars(axis, sizes, 0.55 / len(bars), [_kilonewtons(e) for of in bars.values() for e in of], sds)
+    labels = {when: [_kilonewtons(e) for e in of] for when, of in bars.items()}
+    drawn = _bars(axis, sizes, 0.55 / len(bars), labels, sds)
     handles = drawn if len(bars) > 1 else []
     known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
     for i, low, high in known:
