@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 
 import tomlkit
 from cantools.database.can import Database, Message
-from tomlkit import TOMLDocument
-from tomlkit.items import Table
 
 from soilbus.can.channels import WHOLE
 from soilbus.can.columns import unit_in
@@ -60,28 +58,24 @@ class Proposal(NamedTuple):
 
 @dataclass
 class _Draft:
-    """What is known of the vehicle, the document so far, and the signals that it maps or names."""
+    """What is known of the vehicle, the lines so far, and the signals that they map or name."""
 
     database: Database
     assignment: Assignment
     facts: Facts
-    document: TOMLDocument = field(default_factory=tomlkit.document)
+    lines: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     named: set[str] = field(default_factory=set)
     open: int = 0
 
     def __post_init__(self) -> None:
-        self._here: TOMLDocument | Table = self.document
         self.axles = axles_of(self.assignment)
 
     def put(self, key: str, value: Any, comment: str = "") -> None:
         """A key of the section, with a comment beside it."""
-        item = tomlkit.item(value)
         self.open += _open_values(value)
-        if comment:
-            item.comment(shown(comment))
-            item.trivia.comment_ws = " " * max(2, COLUMN - len(f"{key} = {item.as_string()}"))
-        self._here.add(key, item)
+        line = f"{key} = {tomlkit.item(value).as_string()}"
+        self.lines.append(f"{line.ljust(max(len(line) + 2, COLUMN))}# {shown(comment)}" if comment else line)
 
     def put_open(self, key: str, comment: str) -> None:
         self.put(key, OPEN, comment)
@@ -93,21 +87,11 @@ class _Draft:
 
     def note(self, *texts: str, apart: bool = False) -> None:
         """A comment for each text, below an empty line where they stand apart."""
-        if apart:
-            self._here.add(tomlkit.nl())
-        for text in texts:
-            self._here.add(tomlkit.comment(shown(text)))
+        self.lines += [""] * apart + [f"# {shown(text)}" for text in texts]
 
     def section(self, name: str, repeated: bool = False) -> None:
         """Begin a section, or one more of that name."""
-        self._here = tomlkit.table()
-        self._here.trivia.indent = "\n"
-        if not repeated:
-            self.document.add(name, self._here)
-            return
-        if name not in self.document:
-            self.document.add(name, tomlkit.aot())
-        self.document[name].append(self._here)
+        self.lines += ["", f"[[{name}]]" if repeated else f"[{name}]"]
 
     def matched(self, role: str, place: str = "") -> Candidate | None:
         return self.assignment.asserted.get(Slot(role, place))
@@ -184,7 +168,8 @@ def proposal(
             _put_wheel(draft, wheel, axle, layout)
     _put_signals(draft)
     _put_rest(draft)
-    return Proposal(toml_text(draft.document), len(draft.used), draft.open)
+    text = toml_text(tomlkit.parse("\n".join(draft.lines) + "\n"))
+    return Proposal(text, len(draft.used), draft.open)
 
 
 # --- which motor drives what ---
