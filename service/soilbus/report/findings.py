@@ -1,9 +1,6 @@
-"""A diagnosis as `soilbus diagnose` prints it: JSON (keys: DESIGN.md) and text.
+"""A diagnosis as `soilbus diagnose` prints it: JSON (keys: docs/json.md) and text, which say the same.
 
-    Findings -> findings_json(), findings_text()
-
-Both say the same: verdict and sentence, places of disagreement, effects with parameters and alternatives, the gap
-before and after, and the soil of each recording before and after.  The sentences are made in `statement`.
+The sentences are made in `statement`.
 """
 
 from __future__ import annotations
@@ -12,6 +9,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms
@@ -23,12 +21,11 @@ from soilbus.pipeline.outputs import PARAMETER_FRAMES, known, value_std, values_
 from soilbus.report.next_drive import plan_lines
 from soilbus.report.statement import (
     doubt,
-    is_open,
     no_places,
-    pressure_error,
     same_push,
     shown_lines,
     statement,
+    unseen_errors,
     why_probabilities,
 )
 from soilbus.report.table import AT_EDGE, table, value_text
@@ -38,6 +35,8 @@ from soilbus.words import text_of
 
 MAX_PLACES = 8
 """Places of disagreement that the text lists."""
+PLACE = ("channel", "wheel", "region", "size", "significance", "log")
+"""What JSON says of a place of disagreement."""
 UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
 """Unit of each channel's residuals."""
 
@@ -57,15 +56,15 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "verdict": str(diagnosis.verdict),
         "sentence": statement(diagnosis),
         "doubt": doubt(diagnosis),
-        "where": [_place(place) for place in diagnosis.where],
-        "effects": [_effect(addition, findings.diagnosis.completed) for addition in diagnosis.additions],
+        "where": [{name: getattr(place, name) for name in PLACE} for place in diagnosis.where],
+        "effects": [_effect(addition, diagnosis.completed) for addition in diagnosis.additions],
         "gap": {
             "before": diagnosis.gap_before.value,
             "after": diagnosis.gap_after.value,
             "noise_floor": 1.0,
             "limit": diagnosis.gap_after.limit(),
             "residuals": diagnosis.gap_after.rows,
-            "open": is_open(diagnosis),
+            "open": diagnosis.gap_after.exceeds_noise(),
         },
         "solver": {
             "before": [str(fit.termination) for fit in diagnosis.base.fits],
@@ -76,15 +75,12 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "configured": {name: values_std(values) for name, values in diagnosis.base.prior_parameters().items()},
-        "model": {name: values_std(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "model": {name: values_std(values) for name, values in diagnosis.completed.parameters().items()},
         "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
         "learned": [
             {
-                "channel": description.channel,
-                "wheel": description.wheel,
-                "formula": description.formula,
+                **{name: getattr(description, name) for name in ("channel", "wheel", "formula", "explained")},
                 "terms": {term.regressor: term.coefficient for term in description.terms},
-                "explained": description.explained,
             }
             for description in diagnosis.residual_terms
         ],
@@ -103,23 +99,18 @@ def _shown(findings: Findings) -> dict[str, Any]:
     diagnosis = findings.diagnosis
     if not diagnosis.detectable:
         return {"could_show": None, "could_not_show": None, "unseen": None}
-    before = [diagnosis.soil_before(i) for i in range(len(diagnosis.base.fits))]
-    shown: list[dict[str, Any]] = []
-    unseen: list[dict[str, Any]] = []
-    for found in diagnosis.detectable:
-        of = {"name": found.effect.name, "parameter": found.parameter.name, "unit": found.parameter.unit}
-        if found.size is not None:
-            shown.append(of | {"size": found.size})
-        error, std = pressure_error(found, before, findings.config)
-        if abs(error) > std:
-            unseen.append(of | {"size": found.unseen, "bearing_pressure_error": error, "bearing_pressure_std": std})
-    hidden = [found.effect.name for found in diagnosis.detectable if found.size is None]
-    return {"could_show": shown, "could_not_show": hidden, "unseen": unseen}
 
+    def of(found: Detectable, **more: Any) -> dict[str, Any]:
+        return {"name": found.effect.name, "parameter": found.parameter.name, "unit": found.parameter.unit, **more}
 
-def _place(place: Disagreement) -> dict[str, Any]:
-    names = ("channel", "wheel", "region", "size", "significance", "log")
-    return {name: getattr(place, name) for name in names}
+    return {
+        "could_show": [of(found, size=found.size) for found in diagnosis.detectable if found.size is not None],
+        "could_not_show": [found.effect.name for found in diagnosis.detectable if found.size is None],
+        "unseen": [
+            of(found, size=found.unseen, bearing_pressure_error=error, bearing_pressure_std=std)
+            for found, error, std in unseen_errors(diagnosis, findings.config)
+        ],
+    }
 
 
 def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
@@ -171,7 +162,7 @@ def findings_text(findings: Findings) -> str:
     lines += [f"  {line}" for line in place_lines(findings)]
     lines += [*configured_lines(diagnosis), *shown_lines(diagnosis, findings.config)]
     for number, addition in enumerate(diagnosis.additions, 1):
-        lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+        lines += ["", *effect_lines(number, addition, diagnosis.completed)]
     if findings.plan is not None:
         lines += ["", *plan_lines(findings.plan)]
     if diagnosis.residual_terms:
@@ -197,7 +188,7 @@ def place_lines(findings: Findings) -> list[str]:
         return [no_places(findings.diagnosis)]
     has_several = len(findings.diagnosis.base.fits) > 1
     shown = [
-        f"{f'{p.log}: ' if has_several and p.log else ''}{_channel(p)}, {p.region}: {size_text(p)} "
+        f"{f'{p.log}: ' if has_several and p.log else ''}{_channel(p)}, {p.region}: {_size_text(p)} "
         f"(chance {f'{p.significance:.0e}' if p.significance > 0.0 else '< 1e-300'})"
         for p in where[:MAX_PLACES]
     ]
@@ -209,8 +200,7 @@ def _channel(place: Disagreement | ResidualTerms) -> str:
     return f"{place.channel}.{place.wheel}" if place.wheel else place.channel
 
 
-def size_text(place: Disagreement) -> str:
-    """The size of a disagreement in words."""
+def _size_text(place: Disagreement) -> str:
     if place.region == "scatter":
         return f"residuals {place.size:.2f} times the noise"
     if place.region == "gain":
