@@ -48,7 +48,6 @@ ADVICE = {
 UNLADEN = "Go slowly, add no torque", "Stop, add no torque"
 """The same without and with a stop, where nothing is pulled and the advice would name draft or implement."""
 HELD = {"caution": "Go slowly, caution is held", "no_go": "Stop, no-go is held"}
-ABOVE_BEST = {"go": "Keep going, slip above best", "caution": "Go slowly, slip above best"}
 GONE_ADVICE = "Rely on your own judgement"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
@@ -210,16 +209,11 @@ class Dashboard:
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
-        limit, probability = (
-            known.value("Traversability", "LimitingCause"),
-            known.number("Traversability", "Probability"),
-        )
+        limit = known.value("Traversability", "LimitingCause")
+        probability = known.number("Traversability", "Probability")
         todo = self._advice(state, str(limit))
-        if state == "go" or (probability or 0.0) >= self.vehicle.go:
+        if (probability or 0.0) >= self.vehicle.go:
             todo = HELD.get(state, todo)  # nothing limits it: more windows must say the same
-            slip, best = self.slip().value, self.slip().best
-            if slip is not None and best is not None and round(100.0 * slip) > round(100.0 * best):
-                todo = ABOVE_BEST.get(state, todo)  # in whole per cents, as a driver reads them
         because = [] if limit in (None, "none") else [f"limit: {limit}"]
         because += [] if probability is None else [f"p = {probability:.2f}"]
         return Verdict(NAMES[state], ", ".join((NAMES[state], *because)), todo, state)
@@ -249,13 +243,9 @@ class Dashboard:
         has_no_window = known.number("SoilbusStatus", "Window") is None
         if has_no_window and reason in ("none", "None", "not_excited", "model_gap"):
             return f"the first window takes {self.vehicle.window:g} s", MEASURING
-        if (
-            reason not in REASONS
-            and not known.is_stale("PresentDemand")
-            and known.number("PresentDemand", "Draft") is None
-        ):
-            was_there = any("draft" in values for _, values in self._samples)
-            return "the draft is not heard any more" if was_there else "no sensor shows the draft", "Go carefully"
+        has_draft = known.is_stale("PresentDemand") or known.number("PresentDemand", "Draft") is not None
+        if reason not in REASONS and not has_draft:
+            return "no sensor shows the draft", "Go carefully"
         slip = self.slip().value
         if reason == "standstill" and slip is not None and slip >= CARRYING_SLIP:
             # they make no way, so the service calls it a standstill

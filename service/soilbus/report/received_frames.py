@@ -3,9 +3,8 @@
     stale    if  age > 3 cycle times + 0.2 s
     verdict   =  unknown or no_go as the last frame says it, else the least of the last five frames in a row
 
-The rules are those of dbc/README.md: a frame with a wrong checksum, a repeated counter or no layout counts as not
-received; a value outside the signal's range, not available or an error is None. The same counter with another payload
-shows a second sender.
+These are rules of dbc/README.md: a frame with a wrong checksum or a repeated counter is not received, one counter with
+two payloads shows a second sender, and a value out of range, not available or an error is None.
 """
 
 from __future__ import annotations
@@ -141,8 +140,6 @@ class ReceivedFrames:
     def value(self, message: str, signal: str) -> float | str | None:
         """Return a signal's value, or its name in the value table.
 
-        Returns
-        -------
         None where the frame is stale or has a second sender, or the value is not available, an error or reserved.
         """
         stream, now = self._streams[message], self._clock()
