@@ -38,10 +38,9 @@ from soilbus.pipeline.outputs import json_line
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.process import say
-from soilbus.report.advice import of_use
 from soilbus.report.page import Source
 from soilbus.report.progress import phases, progress
-from soilbus.report.windows import summary, summary_of, why_of_no_use
+from soilbus.report.windows import of_use, summary, summary_of, why_of_no_use
 
 if TYPE_CHECKING:
     from soilbus.simulator.scenario import Scenario
@@ -102,7 +101,7 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     now = useful[-1].posterior
     assert now is not None  # of_use sees to it
     from soilbus.offline.manoeuvre import what_excites  # the diagnosis and scipy, which few replays need
-    from soilbus.report.next_drive import excitation_lines
+    from soilbus.report.findings import excitation_lines
 
     found = what_excites(config, now.soil)
     if found is None:

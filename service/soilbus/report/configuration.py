@@ -30,7 +30,7 @@ from soilbus.pipeline.modelled_drive import modelled_drive
 from soilbus.pipeline.outputs import PARAMETER_FRAMES, check_cycle_times
 from soilbus.report.proposal import BEARING_STD_WITHOUT_CELLS
 from soilbus.report.table import table
-from soilbus.sensors.survey import Seen, Survey
+from soilbus.sensors.survey import Survey
 from soilbus.terra.effects.sensors import lateness
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.words import shown, text_of
@@ -172,27 +172,18 @@ def log_report(log: Log | SignalTable, found: Survey) -> str:
 
 def survey_report(found: Survey) -> str:
     """Return the received values of every mapped signal, and what the recording cannot show."""
-    rows = [_heard_row(seen, found) for seen in found.seen]
+    rows = []
+    for seen in found.seen:
+        of_it = [f for f in found.findings if seen.channel.name in f.channels]
+        status = "plausible" if seen.count else "not heard"
+        if of_it:
+            status = "fault, see below" if any(f.fatal for f in of_it) else "warning, see below"
+        values = [f"{x:.4g}" if seen.count else "-" for x in (seen.low, seen.median, seen.high)]
+        every = f"{1e3 / seen.rate:.0f} ms" if math.isfinite(seen.rate) else "-"
+        refused = str(sum(seen.refused.values()))
+        rows.append((seen.channel.name, str(seen.count), every, *values, seen.unit, refused, status))
     head = ("role", "values", "every", "from", "median", "to", "unit", "refused", "beside the configuration")
     return "\n" + table(head, rows) + text_of(f"not checkable from this log: {line}" for line in found.open)
-
-
-def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
-    of_it = [f for f in found.findings if seen.channel.name in f.channels]
-    status = "fault, see below" if any(f.fatal for f in of_it) else "warning, see below" if of_it else "plausible"
-    if not seen.count:
-        status = status if of_it else "not heard"
-    return (
-        seen.channel.name,
-        str(seen.count),
-        f"{1e3 / seen.rate:.0f} ms" if math.isfinite(seen.rate) else "-",
-        f"{seen.low:.4g}" if seen.count else "-",
-        f"{seen.median:.4g}" if seen.count else "-",
-        f"{seen.high:.4g}" if seen.count else "-",
-        seen.unit,
-        str(sum(seen.refused.values())),
-        status,
-    )
 
 
 def defaults_text(config: Config) -> str:
@@ -311,7 +302,7 @@ def effect_lines(config: Config) -> list[str]:
 
 def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool) -> tuple[str, ...]:
     message = database.get_message_by_name(channel.message)
-    signal = message.get_signal_by_name(channel.signal)
+    unit = message.get_signal_by_name(channel.signal).unit
     status = "SI assumed: no unit given" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
@@ -319,16 +310,9 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
         status += f", late by {channel.delay:g} s"
     if checked:
         status += ", counter and CRC required"
+    factor = f"{channel.factor:g}" + (f", + {channel.offset:g}" if channel.offset else "")
     every = f"{message.cycle_time} ms" if message.cycle_time else "not given"
-    return (
-        channel.name,
-        channel.path,
-        signal.unit or "-",
-        f"{channel.factor:g}" + (f", + {channel.offset:g}" if channel.offset else ""),
-        f"{channel.low:.4g} .. {channel.high:.4g}",
-        every,
-        status,
-    )
+    return channel.name, channel.path, unit or "-", factor, f"{channel.low:.4g} .. {channel.high:.4g}", every, status
 
 
 def identifiable(config: Config) -> dict[str, str]:

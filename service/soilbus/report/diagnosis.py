@@ -8,8 +8,7 @@ from pathlib import Path
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.offline.diagnose import Findings
 from soilbus.report.diagnosis_pictures import agreement_pictures, agreements, draft_picture, gap_picture
-from soilbus.report.findings import findings_text
-from soilbus.report.next_drive import hope_of
+from soilbus.report.findings import findings_text, hope_of
 from soilbus.report.page import Source, Step, page
 from soilbus.report.statement import doubt, headline, plain_gap, statement, to_tell_apart
 

@@ -162,14 +162,25 @@ def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
         for when, of in bars.items()
     )
     height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
-    return picture(lambda figure: _draw_gaps(figure, bars), height, f"error of the model over noise: {words}")
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
+        sizes = {when: list(of.values()) for when, of in bars.items()}
+        labels = {when: [f"{size:.2f}" for size in of] for when, of in sizes.items()}
+        drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
+        axis.set_yticks(range(len(bars["before"])), list(bars["before"]))
+        axis.set_xlabel("model’s error, × noise of the sensors")
+        figure.legend(handles=[*drawn, noise], loc="outside lower center", ncols=3, frameon=False)
+
+    return picture(draw, height, f"error of the model over noise: {words}")
 
 
 def _bars(
     axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Mapping[str, Sequence[str]],
     sd: Mapping[str, Sequence[float]] | None = None,
 ) -> list[Any]:  # fmt: skip
-    """Draw groups of horizontal bars, before above after, each with a label at its end; returns one for each look."""
+    """Draw groups of horizontal bars, before above after, labelled at their ends; returns one for each of two looks."""
     drawn = []
     for i, (when, sizes) in enumerate(bars.items()):
         colour, hatch = LOOKS[when] if len(bars) > 1 else LOOKS["after"]
@@ -179,24 +190,11 @@ def _bars(
             y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error
         )
         axis.bar_label(bar, labels[when], padding=5, fontsize=10)
-        drawn.append(bar)
+        drawn += [bar] if len(bars) > 1 else []
     axis.invert_yaxis()
     axis.set_xlim(min(0.0, axis.get_xlim()[0]), 1.16 * axis.get_xlim()[1])
     axis.grid(axis="y", visible=False)
     return drawn
-
-
-def _draw_gaps(figure: Any, bars: Mapping[str, Mapping[str, float]]) -> None:
-    axis = figure.subplots()
-    channels = list(bars["before"])
-    noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
-    sizes = {when: list(of.values()) for when, of in bars.items()}
-    labels = {when: [f"{size:.2f}" for size in of] for when, of in sizes.items()}
-    drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
-    axis.set_yticks(range(len(channels)), channels)
-    axis.set_xlabel("model’s error, × noise of the sensors")
-    handles = [*(drawn if len(bars) > 1 else []), noise]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
 def draft_picture(findings: Findings) -> Picture | None:
@@ -215,31 +213,28 @@ def draft_picture(findings: Findings) -> Picture | None:
         " ".join([name, *(f"{when} {_kilonewtons(of[i])}" for when, of in bars.items())])
         for i, name in enumerate(names)
     )
-    return picture(
-        lambda figure: _draw_drafts(figure, names, bars, pulled), 1.6 + 0.75 * len(drafts), f"largest draft: {words}"
-    )
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        none = Estimate(0.0, 0.0)
+        sizes, sds = (
+            {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()}
+            for part in ("value", "std")
+        )
+        labels = {when: [_kilonewtons(e) for e in of] for when, of in bars.items()}
+        handles = _bars(axis, sizes, 0.55 / len(bars), labels, sds)
+        known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
+        lines = [
+            axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")[0]
+            for i, low, high in known
+        ]
+        axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
+        axis.set_xlabel("draft, kN")
+        if handles := [*handles, *lines[:1]]:
+            figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+
+    return picture(draw, 1.6 + 0.75 * len(drafts), f"largest draft: {words}")
 
 
 def _kilonewtons(draft: Estimate | None) -> str:
     return "none within the limits" if draft is None else f"{draft.value / 1e3:.2f} kN"
-
-
-def _draw_drafts(
-    figure: Any, names: Sequence[str], bars: Mapping[str, Sequence[Estimate | None]], pulled: Sequence[Array]
-) -> None:
-    axis = figure.subplots()
-    none = Estimate(0.0, 0.0)
-    sizes, sds = (
-        {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()} for part in ("value", "std")
-    )
-    labels = {when: [_kilonewtons(e) for e in of] for when, of in bars.items()}
-    drawn = _bars(axis, sizes, 0.55 / len(bars), labels, sds)
-    handles = drawn if len(bars) > 1 else []
-    known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
-    for i, low, high in known:
-        line = axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")
-        handles = [*(drawn if len(bars) > 1 else []), *line]
-    axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
-    axis.set_xlabel("draft, kN")
-    if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)

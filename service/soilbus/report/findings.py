@@ -6,9 +6,11 @@ The sentences are made in `statement`.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
+from soilbus.config.model import Config
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
@@ -17,8 +19,8 @@ from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.diagnose import Findings
+from soilbus.offline.manoeuvre import MAX_REPEATS, Plan
 from soilbus.pipeline.outputs import PARAMETER_FRAMES, known, value_std, values_std
-from soilbus.report.next_drive import plan_lines
 from soilbus.report.statement import (
     doubt,
     no_places,
@@ -29,6 +31,7 @@ from soilbus.report.statement import (
     why_probabilities,
 )
 from soilbus.report.table import AT_EDGE, table, value_text
+from soilbus.simulator.manoeuvre import Manoeuvre
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.words import text_of
@@ -262,3 +265,36 @@ def _soil_lines(findings: Findings) -> Iterator[str]:
                 rows.setdefault(name, []).append(value_text(of.value / size, of.std / size))
         head = (f"soil of {log}" if several else "soil", "before", "after")
         yield from table(head, [(name, *texts) for name, texts in rows.items()]).splitlines()
+
+
+def plan_lines(plan: Plan) -> list[str]:
+    """Return what to drive next, and what it is expected to settle."""
+    return [
+        f"what to drive next, to decide between {', '.join(plan.between)} ({plan.manoeuvre.duration:.0f} s; "
+        "--manoeuvre-out keeps it):",
+        f"  {plan.manoeuvre.words}",
+        f"  {hope_of(plan)}",
+    ]
+
+
+def hope_of(plan: Plan) -> str:
+    """Return what a plan is expected to settle, and how often it must be driven."""
+    if plan.repeats is None:
+        return f"even {MAX_REPEATS} such drives are not expected to settle it: rather take one of the sensors above"
+    times = "once" if plan.repeats == 1 else f"{plan.repeats} times"
+    return f"driven {times} and diagnosed together with what there is, it is expected to settle the name"
+
+
+def excitation_lines(manoeuvre: Manoeuvre, expected: Posterior, now: Posterior, config: Config) -> list[str]:
+    """Return a manoeuvre, and the standard deviations of the soil that are expected after it."""
+    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
+    shares = []
+    for posterior in (now, expected):
+        pressure = posterior.bearing_pressure(z_ref, b_ref)
+        shares.append((100.0 * pressure.std / pressure.value, math.degrees(posterior.parameters()["phi"].std)))
+    (pressure_now, phi_now), (pressure_then, phi_then) = shares
+    return [
+        f"what to drive next ({manoeuvre.duration:.0f} s; --manoeuvre-out keeps it): {manoeuvre.words}",
+        f"  bearing pressure is known to +- {pressure_now:.2g} % and phi to +- {phi_now:.2g} deg; the sensors alone "
+        f"would then allow {pressure_then:.2g} % and {phi_then:.2g} deg",
+    ]

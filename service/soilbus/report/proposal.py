@@ -172,9 +172,6 @@ def proposal(
     return Proposal(text, len(draft.used), draft.open)
 
 
-# --- which motor drives what ---
-
-
 class _Layout(NamedTuple):
     """Axles that have a section, "" for one motor of an unknown axle; wheels and axles with a torque."""
 
@@ -216,9 +213,6 @@ def _layout_of(draft: _Draft) -> _Layout:
         else:
             axles.append("")
     return _Layout(tuple(axles), frozenset(at & WHEELS), frozenset(driven))
-
-
-# --- sections ---
 
 
 def _put_vehicle(draft: _Draft) -> None:
@@ -388,9 +382,6 @@ def _put_rest(draft: _Draft) -> None:
         draft.note("In the DBC, but never in the log:", *lines, apart=True)
 
 
-# --- words ---
-
-
 def _of_role(draft: _Draft, role: str, place: str = "") -> list[Candidate]:
     """Candidates of an open slot, else those of the role wherever they are, else what has a unit of it there."""
     own = draft.assignment.open.get(Slot(role, place))
@@ -411,8 +402,8 @@ def _kind_by_words(database: Database, c: Candidate) -> str:
     comment = (database.get_message_by_name(c.message).get_signal_by_name(c.signal).comment or "").casefold()
     if "without gravity" in comment:
         return "kinematic"
-    is_force = is_word_in(c, "force") or is_word_in(c, "specific")
-    return "specific_force" if is_force or "specific force" in comment else ""
+    is_force = is_word_in(c, "force", "specific") or "specific force" in comment
+    return "specific_force" if is_force else ""
 
 
 _OTHER_WAY: Mapping[str, str] = {

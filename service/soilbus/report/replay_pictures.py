@@ -21,8 +21,8 @@ from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.posterior import Estimate
 from soilbus.pipeline.result import WindowResult, is_date
-from soilbus.report.advice import of_use
 from soilbus.report.page import Picture, picture
+from soilbus.report.windows import of_use
 from soilbus.terra.earth import offset
 
 SPACE_BETWEEN = 0.03
@@ -215,7 +215,7 @@ def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
     placed = [r for r in results if r.position is not None]
     if len(placed) > 1:
         words = "map of the route, coloured by decision"
-        yield "The route by decision.", picture(lambda figure: _draw_map(figure, placed), 4.0, words)
+        yield "The route by decision.", picture(partial(_draw_map, placed=placed), 4.0, words)
 
 
 def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None]) -> Picture:
