@@ -188,27 +188,20 @@ def survey_report(found: Survey) -> str:
 
 def defaults_text(config: Config) -> str:
     """Return every setting with its value in force, one dotted KEY = VALUE a line."""
-    lines: list[str] = []
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for k, v in value.items():
-                walk(f"{prefix}.{k}" if prefix else k, v)
-        elif prefix in ("axle", "wheel", "track"):
-            for part in value:
-                walk(f"{prefix}.{part['name']}", {k: v for k, v in part.items() if k not in _LISTED})
-        else:
-            lines.append(shown(f"{prefix} = {value}"))
-
     whole = config.model_dump(exclude={"signals", "folder"})
-    tracks = {track["name"] for track in whole["track"]}
-    whole["wheel"] = [wheel for wheel in whole["wheel"] if wheel["name"] not in tracks]
-    walk("", whole)
-    return "\n".join(lines)
+    listed = {"name", *WHEEL_ROLES, *AXLE_ROLES}  # or in the table of signals
+    for kind in ("track", "axle", "wheel"):  # the wheel of a track is the track
+        own = [part for part in whole[kind] if kind != "wheel" or part["name"] not in whole["track"]]
+        whole[kind] = {part["name"]: {k: v for k, v in part.items() if k not in listed} for part in own}
 
+    def lines(path: str, value: Any) -> Iterator[str]:
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                yield from lines(f"{path}.{key}" if path else key, inner)
+        else:
+            yield shown(f"{path} = {value}")
 
-_LISTED = {"name", *WHEEL_ROLES, *AXLE_ROLES}
-"""Keys of a wheel, track or axle that say nothing beside the table of signals."""
+    return "\n".join(lines("", whole))
 
 
 def load_lines(config: Config) -> Iterator[str]:

@@ -42,14 +42,12 @@ class Quantity(NamedTuple):
 
 QUANTITIES = {
     "torque": Quantity("torque", "N m", 1.0), "draft": Quantity("draft", "N", 1.0),
-    "sinkage": Quantity("sinkage", "mm", 1e-3),
+    "sinkage": Quantity("sinkage", "mm", 1e-3), "slip": Quantity("slip", "%", 0.01),
+    "load": Quantity("load of a wheel", "kN", 1e3), "speed": Quantity("ground speed", "m/s", 1.0),
+    "since": Quantity("time", "s", 1.0),
 }  # fmt: skip
-"""The channels."""
-REGRESSORS = {
-    "slip": Quantity("slip", "%", 0.01), "load": Quantity("load of a wheel", "kN", 1e3),
-    "speed": Quantity("ground speed", "m/s", 1.0), "since": Quantity("time", "s", 1.0),
-}  # fmt: skip
-"""What differences are plotted over."""
+"""The channels, and what differences are plotted over."""
+REGRESSORS = ("slip", "load", "speed", "since")
 
 
 class Agreement(NamedTuple):
@@ -57,7 +55,6 @@ class Agreement(NamedTuple):
 
     channel: str
     regressor: str
-    gain: float
     before: tuple[Series, ...]
     after: tuple[Series, ...]
 
@@ -78,8 +75,8 @@ def agreements(base: FittedModel, completed: FittedModel) -> list[Agreement]:
             for name in REGRESSORS
         }
         name = max(gains, key=lambda name: gains[name])
-        found.append(Agreement(channel, name, gains[name], tuple(before), tuple(after)))
-    return sorted(found, key=lambda agreement: -agreement.gain)
+        found.append((gains[name], Agreement(channel, name, tuple(before), tuple(after))))
+    return [agreement for _, agreement in sorted(found, key=lambda pair: -pair[0])]
 
 
 def _trend(series: Series, reference: Series, regressor: str) -> float:
@@ -103,10 +100,8 @@ def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Pictur
         difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
         typical = float(np.sqrt(np.mean(difference**2)))
         caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
-        yield (
-            caption[0].upper() + caption[1:],
-            picture(partial(_draw_agreement, of=of, series=series), 4.6, f"{when}{name}"),
-        )
+        drawn = picture(partial(_draw_agreement, of=of, series=series), 4.6, f"{when}{name}")
+        yield caption[0].upper() + caption[1:], drawn
 
 
 def _ends(values: Array) -> tuple[float, float]:
@@ -119,7 +114,7 @@ def _ends(values: Array) -> tuple[float, float]:
 def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series]) -> None:
     """Above: measured over modelled. Below: the difference over the regressor, with means over bins."""
     whole, part = figure.subplots(2, 1, height_ratios=[1.1, 1.0])
-    unit, regressor = QUANTITIES[of.channel], REGRESSORS[of.regressor]
+    unit, regressor = QUANTITIES[of.channel], QUANTITIES[of.regressor]
     both = of.before + of.after  # whose scales are the same
     readings = _ends(np.concatenate([values for s in both for values in (s.measured, s.modelled)]) / unit.si)
     along = _ends(np.concatenate([getattr(s, of.regressor) for s in both]) / regressor.si)

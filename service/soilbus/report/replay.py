@@ -105,8 +105,7 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[Step
     config = source.config
     good = [r for r in results if r.status is Status.VALID]
     for (status, reason), group in by_reason(results):
-        what = advice(group, good)
-        if what is not None:
+        if what := advice(group, good):
             why = reason.removeprefix(f"{status} ").replace("_", " ")
             yield Step(f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.")
     if any(r.reason.split()[0] in ("model_mismatch", "no_convergence") for r in results):
