@@ -1,7 +1,6 @@
 """The engineer's page: every value of our frames, with history, chi-square of each channel and refused inputs.
 
-Grey figures have a Status other than valid: they are guesses that must not be acted on. "-" is a value that is not
-available or too old. Blocks are packed into as many columns as the width has room for; charts take the rows left.
+Grey figures have a Status other than valid: guesses that must not be acted on; "-" is not available or too old.
 """
 
 from __future__ import annotations

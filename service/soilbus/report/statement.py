@@ -1,8 +1,6 @@
 """A diagnosis in sentences, which text, page and JSON print alike.
 
-    sentence = f(verdict, effects added, gap that remains, places of disagreement)
-
-Each sentence depends on all four at once, so that no two of them contradict each other.
+Each depends on verdict, effects added, gap that remains and places of disagreement at once, so no two contradict.
 """
 
 from __future__ import annotations
@@ -115,10 +113,7 @@ def no_places(diagnosis: Diagnosis) -> str:
 
 
 def doubt(diagnosis: Diagnosis) -> str | None:
-    """Why the finding is doubtful, or None.
-
-    Open fits, sizes at an edge, effects that explain the data only together, effects that were not tried.
-    """
+    """Why the finding is doubtful, or None."""
     found = []
     if not diagnosis.base.converged:  # it has too little evidence, so each effect seems to explain too much beside it
         found.append(

@@ -1,8 +1,6 @@
 """`soilbus watch`: the dashboard on a terminal, of a live bus or of a recording of our frames.
 
-source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second; keys change the page
-                                                   -> lines, for a screen reader and where there is no terminal
-                                                   -> JSON, a line a window, for programs that send it on
+source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second; or lines; or JSON, a line a window
 """
 
 from __future__ import annotations
@@ -124,13 +122,13 @@ def show(
     name = "driver"
     with pressed_keys() as keys, Live(console=console, auto_refresh=False, screen=True) as live:
         redraw = clock()
-        while not (is_over := done()) or (stays and keys is not no_key):
+        while not (is_over := done()) or (stays and keys):
             if is_over:
                 dashboard.is_over = True
                 time.sleep(REDRAW_PERIOD)
             else:
                 _take(dashboard, source, redraw - clock())
-            key = keys()
+            key = keys() if keys else ""
             if key == "q":
                 return
             chosen = {"d": "driver", "e": "engineer", "\t": "engineer" if name == "driver" else "driver"}.get(key, name)
@@ -191,14 +189,9 @@ def _take(dashboard: Dashboard, source: Source, timeout: float) -> Received | ca
     return message
 
 
-def no_key() -> str:
-    """Return no key, where none can be pressed."""
-    return ""
-
-
 @contextmanager
-def pressed_keys() -> Iterator[Callable[[], str]]:
-    """Give a function that returns the next key pressed, or "" at once.
+def pressed_keys() -> Iterator[Callable[[], str] | None]:
+    """Give a function that returns the next key pressed, or "" at once; None where there is no keyboard of ours.
 
     Keys come one by one and are not echoed until the end; Ctrl-C stays what it is.
     """
@@ -208,7 +201,7 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
     except (AttributeError, OSError, ValueError):
         is_ours = False
     if not is_ours:
-        yield no_key
+        yield None
         return
 
     def key() -> str:
