@@ -11,13 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from soilbus.files import write_text
+from soilbus.words import WorkError
 
 if TYPE_CHECKING:
     from soilbus.config.model import Config
-
-
-class WorkError(Exception):
-    """Error of work that could not be done; the text is one line for the user."""
 
 
 def configured(args: argparse.Namespace) -> Config:

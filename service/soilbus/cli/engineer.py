@@ -15,12 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soilbus.can.bus import BusError
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.cli.common import (
-    WorkError,
     check_log_to_write,
     check_outputs,
     configured,
@@ -41,6 +39,7 @@ from soilbus.process import say
 from soilbus.report.page import Source
 from soilbus.report.progress import phases, progress
 from soilbus.report.windows import of_use, summary, summary_of, why_of_no_use
+from soilbus.words import WorkError
 
 if TYPE_CHECKING:
     from soilbus.simulator.scenario import Scenario
@@ -50,10 +49,7 @@ def replay(args: argparse.Namespace) -> None:
     """Run `soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
     config = configured(args)
     _check_files(args, config)
-    try:
-        results, text = (_replay_logs if config.table is None else _replay_tables)(args, config)
-    except LogError as error:
-        raise WorkError(str(error)) from None
+    results, text = (_replay_logs if config.table is None else _replay_tables)(args, config)
     _write_windows(args, config, results, text)
     drive = "" if config.table is not None else _what_to_drive(args, config, results)
     if "-" not in (str(args.json), str(args.map)):
@@ -204,7 +200,6 @@ def simulate(args: argparse.Namespace) -> None:
     """Run `soilbus simulate`: the simulated tractor, to a bus or a log."""
     from soilbus.estimation.assembly import with_effects
     from soilbus.simulator.course import course
-    from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.manoeuvre import LARGEST, of_json
     from soilbus.simulator.play import scenario_over
 
@@ -227,7 +222,7 @@ def simulate(args: argparse.Namespace) -> None:
                 manoeuvre = of_json(read_bounded(args.manoeuvre, LARGEST).decode())
             scenario = manoeuvre.over(scenario, config.tows_nothing)
         bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
-    except (SimulationError, KeyError, ValueError, BusError) as error:
+    except (KeyError, ValueError) as error:
         raise WorkError(str(error.args[0])) from None
     if bogged_at is not None:
         say(f"the tractor is stuck after {bogged_at:.1f} s")
@@ -266,9 +261,7 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
 
 def diagnose(args: argparse.Namespace) -> None:
     """Run `soilbus diagnose`: find, name, add, show, and say what to drive next."""
-    from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
-    from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
     from soilbus.report.findings import findings_json, findings_text
 
@@ -281,11 +274,8 @@ def diagnose(args: argparse.Namespace) -> None:
     check_outputs(args.json, args.report, args.model_out, args.manoeuvre_out, read=_read_files(args, config))
     for line in channel_notes(config, args.logs) if config.table is None else []:
         say(line)
-    try:
-        with phases("diagnose") as phase:
-            findings = diagnose_logs(config, args.logs, phase)
-    except (LogError, NotFitted, TooLittle) as error:
-        raise WorkError(str(error)) from None
+    with phases("diagnose") as phase:
+        findings = diagnose_logs(config, args.logs, phase)
     texts: list[tuple[Path, str]] = []
     if args.json is not None:
         texts.append((args.json, findings_json(findings)))
@@ -315,7 +305,7 @@ def batch(args: argparse.Namespace) -> None:
     for module in ("distributed", "pyarrow"):
         need_extra(module, "batch", "batch")
     from soilbus.offline.batch import check_out, results_in, run_batch
-    from soilbus.offline.cluster import BatchError, cluster
+    from soilbus.offline.cluster import cluster
     from soilbus.offline.jobs import jobs_of
     from soilbus.report.batch import batch_text
 
@@ -326,8 +316,6 @@ def batch(args: argparse.Namespace) -> None:
         jobs = jobs_of(config, Path(args.config or found_configuration(None)).name, args.logs, own, parts)
         with phases("batch") as progress, cluster(args.scheduler) as client, results_in(args.out):
             done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose, args.retry)
-    except BatchError as error:
-        raise WorkError(str(error)) from None
     except KeyboardInterrupt:
         say("stopped; --resume goes on from here")
         raise

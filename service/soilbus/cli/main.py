@@ -12,9 +12,8 @@ from importlib import import_module
 
 from soilbus.allocator import loading
 from soilbus.cli.arguments import command_line
-from soilbus.cli.common import WorkError
-from soilbus.files import NotWritten
 from soilbus.process import output_fault, say
+from soilbus.words import WorkError
 
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -45,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for fault in error.faults:
             say(fault)
         return WRONG_USAGE
-    except (WorkError, NotWritten) as error:
+    except WorkError as error:
         say(str(error))
         return FAILED
     except KeyboardInterrupt:

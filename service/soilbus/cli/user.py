@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import WorkError, check_outputs, configured, configured_or_reference, need_extra
+from soilbus.cli.common import check_outputs, configured, configured_or_reference, need_extra
 from soilbus.files import write_text
 from soilbus.process import ENDING, say
+from soilbus.words import WorkError
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -42,7 +43,7 @@ def demo(args: argparse.Namespace) -> None:
 def init(args: argparse.Namespace) -> None:
     """Run `soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
     from soilbus.can.dbc_files import load_databases
-    from soilbus.can.logs import Log, LogError
+    from soilbus.can.logs import Log
     from soilbus.can.role_matching import assigned, candidates
     from soilbus.config.edit import named_from
     from soilbus.config.file import located, parse_config
@@ -69,15 +70,10 @@ def init(args: argparse.Namespace) -> None:
                 log = Log(args.log, args.channel or "", demanded=True)
     except ConfigError as error:
         raise ConfigError(fault.replace("dbc.input", "--dbc") for fault in error.faults) from None
-    except LogError as error:
-        raise WorkError(str(error)) from None
     found, facts = candidates(database), Facts()
     if log is not None:
-        try:
-            with progress("init") as step:
-                recording = recording_of(found, database, _counted(log.frames(), step))
-        except LogError as error:
-            raise WorkError(str(error)) from None
+        with progress("init") as step:
+            recording = recording_of(found, database, _counted(log.frames(), step))
         if log.note:
             say(log.note)
         if not recording.columns:
@@ -110,7 +106,6 @@ def run(args: argparse.Namespace) -> None:
     # python-can loads asammdf where it is installed: 2 s and 97 MB for files that the service never reads.
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
-        from soilbus.can.bus import BusError
         from soilbus.config.model import ConfigError
         from soilbus.daemon.start import start_service
 
@@ -118,11 +113,7 @@ def run(args: argparse.Namespace) -> None:
         if config.table is not None or config.columns is not None:
             source = "[columns]: a table" if config.table is None else "[table]: a table of a test rig"
             raise ConfigError([f"{source} has no bus; replay and diagnose read it"])
-        wait = args.wait or "NOTIFY_SOCKET" in os.environ
-        try:
-            service = start_service(config, wait)
-        except BusError as error:
-            raise WorkError(str(error)) from None
+        service = start_service(config, args.wait or "NOTIFY_SOCKET" in os.environ)
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
             signal.signal(number, lambda *_: service.stop())
@@ -163,24 +154,21 @@ def check(args: argparse.Namespace) -> None:
 
 def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | SignalTable | None]:
     """What a recording, or the bus, says of the configuration, and the recording as far as it was read."""
-    from soilbus.can.bus import BusError, heard_for
+    from soilbus.can.bus import heard_for
     from soilbus.can.dbc_files import load_databases
     from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError, log_of
+    from soilbus.offline.replay import log_of
     from soilbus.report.progress import progress
     from soilbus.sensors.survey import survey
 
     if config.table is not None:
         raise ConfigError(["[table]: check compares no table; replay and diagnose read it"])
     database = load_databases(config)
-    try:
-        if args.live is not None:
-            return survey(config, database, heard_for(config.bus.model_dump(), args.live)), None
-        log = log_of(config, args.log)
-        with progress("check") as step:
-            return survey(config, database, _counted(log.frames(), step)), log
-    except (LogError, BusError) as error:
-        raise WorkError(str(error)) from None
+    if args.live is not None:
+        return survey(config, database, heard_for(config.bus.model_dump(), args.live)), None
+    log = log_of(config, args.log)
+    with progress("check") as step:
+        return survey(config, database, _counted(log.frames(), step)), log
 
 
 def _machine_of(log: Path, config: Config) -> str:
@@ -210,9 +198,7 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 
 def watch(args: argparse.Namespace) -> None:
     """Run `soilbus watch`: the dashboard of the live bus or of a recording."""
-    from soilbus.can.bus import BusError
     from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError
     from soilbus.report.watch import watch
 
     if args.channel is not None:
@@ -220,10 +206,7 @@ def watch(args: argparse.Namespace) -> None:
             raise ConfigError([f"--channel {args.channel}: {args.log} is a recording, which has no bus"])
         args.set.append(f"bus.channel={json.dumps(args.channel)}")
     config, is_named = configured_or_reference(args), args.config is not None
-    try:
-        watch(config, args.log, args.speed, is_named, args.seconds, args.plain, args.json)
-    except (BusError, LogError) as error:
-        raise WorkError(str(error)) from None
+    watch(config, args.log, args.speed, is_named, args.seconds, args.plain, args.json)
 
 
 def completion(args: argparse.Namespace) -> None:
