@@ -37,12 +37,7 @@ Rows = Iterator[tuple[Any, ...]]
 
 
 def table(number: int, sinkage: float = SINKAGE) -> PaperTable:
-    """Return table 3, 4, 6 or 7 of the paper, beside its method run again on its own equations.
-
-    Parameters
-    ----------
-    sinkage
-        Of the simulated wheels [m], which the paper does not print.
+    """Return table 3, 4, 6 or 7 of the paper beside its method run again, for simulated wheels of a sinkage [m].
 
     Returns
     -------

@@ -35,7 +35,7 @@ from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.estimation.assembly import with_effects
-from soilbus.files import whole_file
+from soilbus.files import write_text
 from soilbus.offline.diagnose import Findings, diagnose_logs
 from soilbus.offline.replay import fed
 from soilbus.offline.replay import replay as replay_logs
@@ -154,8 +154,7 @@ class Diagnosis:
         out = Path(out)
         effects, notes = effect_tables(self.findings.diagnosis.completed)
         text = with_effects_text(self.path, [], effects, out.parent, notes)
-        with whole_file(out) as file:
-            file.write(text)
+        write_text(out, text)
 
 
 def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:
@@ -222,12 +221,8 @@ def simulate(
     ----------
     log
         File that gets the frames; its name's end picks the format. None for none.
-    config
-        The vehicle; by default the reference tractor.
-    soil
-        Name of a known soil, or of several, each for an equal part of the time.
-    duration
-        [s].
+    soil, duration
+        Known soils by name, each for an equal part of the time [s].
     effects
         Effects that are there and that the service does not know of: {"slip_sinkage": 0.4, "hardpan.depth": 0.05}.
     seed

@@ -61,10 +61,8 @@ def wheel_forces(
         W [N]; None where the sinkage is given.
     slip
         1 - V/(r omega); negative where the wheel brakes.
-    radius, width
-        r and b [m].
-    sinkage
-        z [m] in place of the load.
+    radius, width, sinkage
+        r, b and, in place of the load, z [m].
     model
         Shear law, "exponential" (Janosi & Hanamoto) or "rational" (Xi et al. 2024), or a whole wheel-soil model.
     effects

@@ -1,11 +1,7 @@
 """`soilbus demo`: a simulated tractor, the service and a dashboard, without hardware.
 
-All frames are on one bus: the tractor's, which the service hears, and the service's, which the dashboard reads.  The
-bus is a vcan where the kernel has it, else python-can's in-process virtual bus.  The drive plays SPEED times as fast as
-it is driven.  The service runs on the drive's time, which waits for a machine that is busy.
-
-    soilbus demo --picture service/docs/dashboard.svg     draws the README's pictures: dashboard.svg, the driver's page
-                                                          at the end of the drive, and dashboard-engineer.svg
+Tractor and service share one bus, a vcan where the kernel has it, else python-can's in-process virtual bus.  The drive
+plays SPEED times as fast as it is driven; the service runs on its time, which waits for a machine that is busy.
 """
 
 from __future__ import annotations
@@ -28,7 +24,6 @@ from soilbus.can.bus import open_bus
 from soilbus.can.candump import Frame
 from soilbus.can.channels import Column
 from soilbus.can.dbc_files import filters_of, output_database
-from soilbus.config.model import Config
 from soilbus.files import write_text
 from soilbus.offline.sent_frames import sent_beside
 from soilbus.pipeline.result import WindowResult
@@ -69,7 +64,12 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
         bus = config.bus.model_dump()
         with open_bus(bus, []) as tractor, open_bus(bus, []) as node, open_bus(bus, filters_of(ours)) as ear:
             drive = _Drive(list(frames(_every_second(recording), real)), tractor, ear)
-            service = threading.Thread(target=_serve, args=(config, drive.heard(), node, results), daemon=True)
+
+            def serve() -> None:
+                for message in sent_beside(config, drive.heard(), results.append):
+                    node.send(message)
+
+            service = threading.Thread(target=serve, daemon=True)
             service.start()
             dashboard = Dashboard(ReceivedFrames(ours, drive.now), Vehicle.of(config), span=duration)
             show(dashboard, drive, console, done=lambda: not service.is_alive())
@@ -118,12 +118,6 @@ class _Drive:
         return message
 
 
-def _serve(config: Config, heard: Iterator[Frame], node: can.BusABC, results: list[WindowResult]) -> None:
-    """Run the service on the frames that it hears and send its own."""
-    for message in sent_beside(config, heard, results.append):
-        node.send(message)
-
-
 @contextmanager
 def _bus_settings() -> Iterator[list[str]]:
     """Overrides for a vcan of our own if we may make one, else for the virtual bus."""
@@ -154,21 +148,17 @@ def _svg(shown: Group) -> str:
 
 def _story(results: list[WindowResult]) -> str:
     """The windows some seconds apart, as a table."""
-    rows, due = [], 0.0
-    start = results[0].t if results else 0.0
+    rows, due = [], results[0].t if results else 0.0
+    begin = due
     for r in results:
-        t = r.t - start
-        if t + 1e-6 < due:
+        if r.t + 1e-6 < due:
             continue
-        due = t + STORY_PERIOD
-        draft = r.traversability.max_draft
-        rows.append(
-            (
-                f"{t + 10.0:.0f}",
-                str(r.status),
-                "-" if r.bearing is None else f"{r.bearing.value / 1e3:.1f} ± {r.bearing.std / 1e3:.1f}",
-                "-" if draft is None else f"{draft.value:.0f} ± {draft.std:.0f}",
-                str(r.traversability.state).upper().replace("_", "-"),
-            )
-        )
+        due, draft = r.t + STORY_PERIOD, r.traversability.max_draft
+        rows.append((
+            f"{r.t - begin + 10.0:.0f}",
+            str(r.status),
+            "-" if r.bearing is None else f"{r.bearing.value / 1e3:.1f} ± {r.bearing.std / 1e3:.1f}",
+            "-" if draft is None else f"{draft.value:.0f} ± {draft.std:.0f}",
+            str(r.traversability.state).upper().replace("_", "-"),
+        ))  # fmt: skip
     return table(("tractor's s", "window", "bearing pressure, kPa", "max. draft, N", "decision"), rows)

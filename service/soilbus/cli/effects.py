@@ -37,9 +37,9 @@ def parameter_rows(effect: Effect) -> list[tuple[str, ...]]:
 
 def effect_text(effect: Effect) -> str:
     """Return one effect in full, as text."""
-    parts = [f"{effect.name}\n", _wrapped(effect.physics), table(HEAD, parameter_rows(effect))]
-    parts += [_wrapped(f"Shown by: {effect.tells}"), _wrapped(f"Source: {effect.source}")]
-    return "\n".join(parts)
+    physics, *texts = effect.physics, f"Shown by: {effect.tells}", f"Source: {effect.source}"
+    parts = [effect.name, textwrap.fill(physics, WIDTH), table(HEAD, parameter_rows(effect)).rstrip("\n")]
+    return "\n\n".join([*parts, *(textwrap.fill(text, WIDTH) for text in texts)]) + "\n"
 
 
 def overview(effects: Iterable[Effect]) -> str:
@@ -64,7 +64,3 @@ def effect_records(effects: Iterable[Effect]) -> list[dict[str, Any]]:
         }
         for effect in effects
     ]
-
-
-def _wrapped(text: str) -> str:
-    return textwrap.fill(text, WIDTH) + "\n"

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
@@ -39,10 +38,8 @@ from soilbus.process import say
 from soilbus.report.page import Source
 from soilbus.report.progress import phases, progress
 from soilbus.report.windows import of_use, summary, summary_of, why_of_no_use
+from soilbus.simulator.scenario import Scenario
 from soilbus.words import WorkError
-
-if TYPE_CHECKING:
-    from soilbus.simulator.scenario import Scenario
 
 
 def replay(args: argparse.Namespace) -> None:
@@ -162,13 +159,13 @@ def _check_files(args: argparse.Namespace, config: Config) -> None:
         if path is not None:
             check_position_is_mapped(config, option)
     if args.report is not None:
-        _need_plots()
+        need_extra("plots", "--report", "jinja2", "matplotlib")
     if args.table is not None and args.table.suffix == ".parquet":
-        need_extra("pyarrow", "tables", "--table OUT.parquet")
+        need_extra("tables", "--table OUT.parquet", "pyarrow")
     if args.mcap is not None:
-        need_extra("mcap", "mcap", "--mcap")
+        need_extra("mcap", "--mcap", "mcap")
     if args.map is not None and args.map.suffix == ".gpkg":
-        need_extra("pyogrio", "geo", "--map OUT.gpkg")
+        need_extra("geo", "--map OUT.gpkg", "pyogrio")
     check_log_to_write(args.frames)
     written = args.json, args.report, args.table, args.mcap, args.map, args.frames, args.manoeuvre_out
     check_outputs(*written, read=_read_files(args, config))
@@ -183,12 +180,6 @@ def _check_files(args: argparse.Namespace, config: Config) -> None:
 def _read_files(args: argparse.Namespace, config: Config) -> list[Path]:
     """What replay and diagnose read: logs, configuration and DBCs."""
     return [*args.logs, Path(found_configuration(args.config)), *map(Path, config.dbc.input)]
-
-
-def _need_plots() -> None:
-    """What --report needs."""
-    for module in ("jinja2", "matplotlib"):
-        need_extra(module, "plots", "--report")
 
 
 def _source(args: argparse.Namespace, config: Config) -> Source:
@@ -206,7 +197,7 @@ def simulate(args: argparse.Namespace) -> None:
     check_log_to_write(args.log)
     check_outputs(args.truth, args.log)
     if args.truth is not None and args.truth.suffix == ".parquet":
-        need_extra("pyarrow", "tables", "--truth OUT.parquet")
+        need_extra("tables", "--truth OUT.parquet", "pyarrow")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
@@ -269,7 +260,7 @@ def diagnose(args: argparse.Namespace) -> None:
     if config.table is not None and args.manoeuvre_out is not None:
         raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
     if args.report is not None:
-        _need_plots()
+        need_extra("plots", "--report", "jinja2", "matplotlib")
         from soilbus.report.diagnosis import diagnosis_report
     check_outputs(args.json, args.report, args.model_out, args.manoeuvre_out, read=_read_files(args, config))
     for line in channel_notes(config, args.logs) if config.table is None else []:
@@ -302,8 +293,7 @@ def batch(args: argparse.Namespace) -> None:
         return load_config(found_configuration(str(path)), args.set).model_copy(update={"log_channel": args.channel})
 
     config = configured(args)
-    for module in ("distributed", "pyarrow"):
-        need_extra(module, "batch", "batch")
+    need_extra("batch", "batch", "distributed", "pyarrow")
     from soilbus.offline.batch import check_out, results_in, run_batch
     from soilbus.offline.cluster import cluster
     from soilbus.offline.jobs import jobs_of

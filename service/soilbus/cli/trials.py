@@ -10,6 +10,7 @@ import os
 from contextlib import nullcontext
 
 from soilbus.cli.common import configured_or_reference, report
+from soilbus.config.model import ConfigError
 from soilbus.files import whole_file
 from soilbus.words import WorkError
 
@@ -23,7 +24,6 @@ def paper(args: argparse.Namespace) -> None:
 
 def decisions(args: argparse.Namespace) -> None:
     """Run `soilbus decisions`: predictions beside what simulated drives then do."""
-    from soilbus.config.model import ConfigError
     from soilbus.trials.bogging_trials import warning_trials
     from soilbus.trials.decisions_report import as_json, decisions_report
     from soilbus.trials.draft_trials import draft_trials

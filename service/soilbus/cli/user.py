@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
 from soilbus.cli.common import check_outputs, configured, configured_or_reference, need_extra
+from soilbus.config.model import Config, ConfigError
 from soilbus.files import write_text
 from soilbus.process import ENDING, say
 from soilbus.words import WorkError
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from soilbus.can.candump import Frame
     from soilbus.can.logs import Log
-    from soilbus.config.model import Config
     from soilbus.offline.columns import SignalTable
     from soilbus.sensors.survey import Survey
 
@@ -47,7 +47,6 @@ def init(args: argparse.Namespace) -> None:
     from soilbus.can.role_matching import assigned, candidates
     from soilbus.config.edit import named_from
     from soilbus.config.file import located, parse_config
-    from soilbus.config.model import ConfigError
     from soilbus.report.progress import progress
     from soilbus.report.proposal import proposal
     from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
@@ -106,7 +105,6 @@ def run(args: argparse.Namespace) -> None:
     # python-can loads asammdf where it is installed: 2 s and 97 MB for files that the service never reads.
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
-        from soilbus.config.model import ConfigError
         from soilbus.daemon.start import start_service
 
         config = configured(args)
@@ -122,7 +120,6 @@ def run(args: argparse.Namespace) -> None:
 
 def check(args: argparse.Namespace) -> None:
     """Run `soilbus check`: the configuration, and with a recording or a live bus the data beside it."""
-    from soilbus.config.model import ConfigError
     from soilbus.report.configuration import (
         configuration_report,
         configuration_warnings,
@@ -156,7 +153,6 @@ def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | S
     """What a recording, or the bus, says of the configuration, and the recording as far as it was read."""
     from soilbus.can.bus import heard_for
     from soilbus.can.dbc_files import load_databases
-    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import log_of
     from soilbus.report.progress import progress
     from soilbus.sensors.survey import survey
@@ -198,7 +194,6 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 
 def watch(args: argparse.Namespace) -> None:
     """Run `soilbus watch`: the dashboard of the live bus or of a recording."""
-    from soilbus.config.model import ConfigError
     from soilbus.report.watch import watch
 
     if args.channel is not None:
@@ -211,7 +206,7 @@ def watch(args: argparse.Namespace) -> None:
 
 def completion(args: argparse.Namespace) -> None:
     """Run `soilbus completion`: a shell's completion of commands, options and files."""
-    need_extra("shtab", "completion", "completion")
+    need_extra("completion", "completion", "shtab")
     import shtab
 
     from soilbus.cli.arguments import command_line, subcommands
@@ -226,7 +221,6 @@ def completion(args: argparse.Namespace) -> None:
 
 def docs(args: argparse.Namespace) -> None:
     """Run `soilbus docs`: the pages of this version, and the README of `dbc` and of `systemd`."""
-    from soilbus.config.model import ConfigError
     from soilbus.words import did_you_mean
 
     package = Path(__file__).resolve().parents[1]
