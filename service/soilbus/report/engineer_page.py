@@ -137,20 +137,18 @@ def _wheels(dashboard: Dashboard) -> list[Text]:
 def _limits(dashboard: Dashboard) -> list[Text]:
     """Largest draft and slope beside the present ones; a slope in per cent is 100 times its tangent."""
     known = dashboard.known
-    rows: list[Row] = [
-        (name, _pair(known, draft, "MaxDraft"), _slope(known, slope)) for name, (draft, slope) in LIMITS.items()
-    ]
+
+    def slope_of(message: str) -> Text:
+        angle, spread = known.number(message, "MaxGrade"), known.number(message, "MaxGradeStd")
+        if angle is None or spread is None or abs(angle) >= math.pi / 2.0:
+            return _cell(known, message, None)
+        slope = math.tan(angle)
+        return _cell(known, message, _figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)))
+
+    rows: list[Row] = [(name, _pair(known, of, "MaxDraft"), slope_of(grade)) for name, (of, grade) in LIMITS.items()]
     draft, pitch = (known.number("PresentDemand", name) for name in ("Draft", "Slope"))
     now = ("now", "-" if draft is None else f"{draft:.0f}", "-" if pitch is None else f"{100.0 * math.tan(pitch):.1f}")
     return grid(("largest", "draft, N", "slope, %"), *rows, now)
-
-
-def _slope(known: ReceivedFrames, message: str) -> Text:
-    angle, spread = known.number(message, "MaxGrade"), known.number(message, "MaxGradeStd")
-    if angle is None or spread is None or abs(angle) >= math.pi / 2.0:
-        return _cell(known, message, None)
-    slope = math.tan(angle)
-    return _cell(known, message, _figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)))
 
 
 def _advice(dashboard: Dashboard) -> list[Text]:
@@ -166,9 +164,11 @@ def _advice(dashboard: Dashboard) -> list[Text]:
 
 
 def _gap(dashboard: Dashboard) -> list[Text]:
-    channels = ("Torque", "Draft", "Sinkage")
-    rows: list[Row] = [("window", _one(dashboard, "SoilStrength", "Chi2", "{:.1f}"))]
-    rows += [(c.lower(), _one(dashboard, "WindowQuality", f"Chi2{c}", "{:.2f}")) for c in channels]
+    known = dashboard.known
+    rows: list[Row] = [("window", _cell(known, "SoilStrength", known.number("SoilStrength", "Chi2"), "{:.1f}"))]
+    for channel in ("Torque", "Draft", "Sinkage"):
+        chi2 = known.number("WindowQuality", f"Chi2{channel}")
+        rows.append((channel.lower(), _cell(known, "WindowQuality", chi2, "{:.2f}")))
     return grid(("gap (chi-square)", "1 is noise"), *rows)
 
 
@@ -220,10 +220,6 @@ def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> str:
 def _cell(known: ReceivedFrames, message: str, value: object, form: str = "{}") -> Text:
     """Grey where the message must not be acted on; None: not known."""
     return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
-
-
-def _one(dashboard: Dashboard, message: str, signal: str, form: str) -> Text:
-    return _cell(dashboard.known, message, dashboard.known.number(message, signal), form)
 
 
 def _pair(known: ReceivedFrames, message: str, signal: str, std: str | None = None) -> Text:

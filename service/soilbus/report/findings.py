@@ -27,6 +27,7 @@ from soilbus.report.statement import (
     same_push,
     shown_lines,
     statement,
+    tells,
     unseen_errors,
     why_probabilities,
 )
@@ -220,12 +221,13 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
     lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]
     for name, estimate in completed.parameters()[effect.name].items():
         lines.append(f"   {name} = {value_text(estimate.value, estimate.std, AT_EDGE)}{_unit_of(name, effect)}")
-    lines += [f"   {line}" for line in filter(None, [same_push(addition, completed)])]
+    if same := same_push(addition, completed):
+        lines.append(f"   {same}")
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
         lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", f"   {why_probabilities(addition)}"]
         lines += ["   what would tell them apart:"]
-        lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
+        lines += [f"   - {line}" for line in tells([effect.name, *addition.alternatives])]
     return lines
 
 
@@ -269,12 +271,9 @@ def _soil_lines(findings: Findings) -> Iterator[str]:
 
 def plan_lines(plan: Plan) -> list[str]:
     """Return what to drive next, and what it is expected to settle."""
-    return [
-        f"what to drive next, to decide between {', '.join(plan.between)} ({plan.manoeuvre.duration:.0f} s; "
-        "--manoeuvre-out keeps it):",
-        f"  {plan.manoeuvre.words}",
-        f"  {hope_of(plan)}",
-    ]
+    between, seconds = ", ".join(plan.between), plan.manoeuvre.duration
+    head = f"what to drive next, to decide between {between} ({seconds:.0f} s; --manoeuvre-out keeps it):"
+    return [head, f"  {plan.manoeuvre.words}", f"  {hope_of(plan)}"]
 
 
 def hope_of(plan: Plan) -> str:

@@ -19,17 +19,7 @@ from cantools.database.can import Database, Message
 from soilbus.can.channels import WHOLE
 from soilbus.can.columns import unit_in
 from soilbus.can.mapping import DIMENSIONS, VEHICLE_ROLES
-from soilbus.can.role_matching import (
-    AXLES,
-    ONLY,
-    WHEELS,
-    Assignment,
-    Candidate,
-    Slot,
-    axles_of,
-    described,
-    is_word_in,
-)
+from soilbus.can.role_matching import AXLES, ONLY, WHEELS, Assignment, Candidate, Slot, axles_of, described, is_word_in
 from soilbus.can.validity import vouching_codes
 from soilbus.config.edit import toml_text
 from soilbus.config.file import OPEN
@@ -73,8 +63,8 @@ class _Draft:
 
     def put(self, key: str, value: Any, comment: str = "") -> None:
         """A key of the section, with a comment beside it."""
-        self.open += _open_values(value)
         line = f"{key} = {tomlkit.item(value).as_string()}"
+        self.open += line.count(f'"{OPEN}"')
         self.lines.append(f"{line.ljust(max(len(line) + 2, COLUMN))}# {shown(comment)}" if comment else line)
 
     def put_open(self, key: str, comment: str) -> None:
@@ -129,11 +119,6 @@ class _Draft:
         elif not c.unit and c.dimension:
             remarks.append("no unit in the DBC: SI assumed")
         self.put(key, value if len(value) > 1 else c.path, "; ".join(remarks))
-
-
-def _open_values(value: Any) -> int:
-    """The number of values that are open in one of the file."""
-    return sum(map(_open_values, value.values())) if isinstance(value, Mapping) else int(value == OPEN)
 
 
 def proposal(
@@ -217,11 +202,11 @@ def _layout_of(draft: _Draft) -> _Layout:
 
 def _put_vehicle(draft: _Draft) -> None:
     draft.section("vehicle")
-    mass = f"; the loads sum to {draft.facts.mass:.0f} kg in the log" if math.isfinite(draft.facts.mass) else ""
+    facts = draft.facts
+    mass = f"; the loads sum to {facts.mass:.0f} kg in the log" if math.isfinite(facts.mass) else ""
     draft.put_open("mass", f"kg with ballast, tank and driver{mass}")
-    if len(draft.axles) == 2:
-        ends, share = "front to rear axle", "wheelbase * load of the front axle / weight"
-    else:
+    ends, share = "front to rear axle", "wheelbase * load of the front axle / weight"
+    if len(draft.axles) != 2:
         ends, share = "first to last axle", "sum of each axle's load * its distance to the last one / weight"
     draft.put_open("wheelbase", f"m, {ends}")
     draft.put_open("cg_ahead_of_rear_axle", f"m, centre of gravity: {share}")

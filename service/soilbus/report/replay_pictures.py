@@ -175,10 +175,17 @@ def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[
     plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
     firm = f"How firm is the ground? Pressure that carries {plate}."
     agreement = "How well do model and sensors agree? At 1 as well as the sensors’ noise allows."
+
+    def draw_gap(axis: Any) -> None:
+        _band(axis, time, lambda r: None if r.chi2 is None else Estimate(math.sqrt(r.chi2), 0.0), 1.0)
+        axis.axhline(1.0, color="0.3", lw=1.0, ls="--")
+        low, high = axis.get_ylim()
+        axis.set_ylim(min(low, 0.5), max(high, 1.5))
+
     if of_use(results):
         yield firm, _over_time(time, "bearing pressure, kPa", lambda a: _band(a, time, lambda r: r.bearing, 1e3))
         yield HOLD.format("does the ground"), _over_time(time, "friction angle, °", lambda a: _band(a, time, *FRICTION))
-        yield agreement, _over_time(time, "model’s error, × noise", lambda a: _draw_gap(a, time))
+        yield agreement, _over_time(time, "model’s error, × noise", draw_gap)
     for caption, label, quantity, unit in (
         ("How much does each wheel slip?", "slip of each wheel, %", "slip", 0.01),
         ("How deep does each wheel sink, by the estimated soil?", "sinkage of each wheel, mm", "sinkage", 1e-3),
@@ -213,9 +220,38 @@ def run_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
 def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
     """Yield the caption and picture of the route by decision; none without positions."""
     placed = [r for r in results if r.position is not None]
-    if len(placed) > 1:
-        words = "map of the route, coloured by decision"
-        yield "The route by decision.", picture(partial(_draw_map, placed=placed), 4.0, words)
+    if len(placed) < 2:
+        return
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        latitude, longitude = np.array([r.position for r in placed]).T
+        first = float(latitude[0]), float(longitude[0])
+        north, east = offset(*first, latitude, longitude)
+        begin = 0
+        for part in stretches(placed):
+            end = begin + len(part)
+            axis.plot(east[begin:end], north[begin:end], "-", color="0.6", lw=0.8, zorder=1)
+            begin = end
+        at = np.column_stack([east, north])
+        for state, look in STATES.items():
+            here = at[[r.traversability.state is state for r in placed]]
+            if len(here):
+                axis.scatter(
+                    *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
+                )
+        axis.legend(loc="best")
+        axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.margins(0.08)
+        place = ", ".join(
+            f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
+            for i, angle in enumerate(first)
+        )
+        axis.set_xlabel(f"m east of the start ({place})")
+        axis.set_ylabel("m north")
+
+    yield "The route by decision.", picture(draw, 4.0, "map of the route, coloured by decision")
 
 
 def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None]) -> Picture:
@@ -262,45 +298,9 @@ def _band(
         axis.set_ylim(bottom=max(axis.get_ylim()[0], 0.0))
 
 
-def _draw_gap(axis: Any, time: TimeAxis) -> None:
-    _band(axis, time, lambda r: None if r.chi2 is None else Estimate(math.sqrt(r.chi2), 0.0), 1.0)
-    axis.axhline(1.0, color="0.3", lw=1.0, ls="--")
-    low, high = axis.get_ylim()
-    axis.set_ylim(min(low, 0.5), max(high, 1.5))
-
-
 def _draw_wheels(axis: Any, time: TimeAxis, wheels: Sequence[str], quantity: str, unit: float) -> None:
     styles = ("-", "--", "-.", ":")
     for i, wheel in enumerate(wheels):
         t, value = time.curve(lambda r, wheel=wheel: getattr(r, quantity)[wheel]).T  # type: ignore[misc]
         axis.plot(t, value / unit, styles[i % 4], color=f"C{i}", lw=1.4, label=wheel)
     axis.legend(ncols=4, loc="best")
-
-
-def _draw_map(figure: Any, placed: Sequence[WindowResult]) -> None:
-    axis = figure.subplots()
-    latitude, longitude = np.array([r.position for r in placed]).T
-    first = float(latitude[0]), float(longitude[0])
-    north, east = offset(*first, latitude, longitude)
-    begin = 0
-    for part in stretches(placed):
-        end = begin + len(part)
-        axis.plot(east[begin:end], north[begin:end], "-", color="0.6", lw=0.8, zorder=1)
-        begin = end
-    at = np.column_stack([east, north])
-    for state, look in STATES.items():
-        here = at[[r.traversability.state is state for r in placed]]
-        if len(here):
-            axis.scatter(
-                *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
-            )
-    axis.legend(loc="best")
-    axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.margins(0.08)
-    place = ", ".join(
-        f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
-        for i, angle in enumerate(first)
-    )
-    axis.set_xlabel(f"m east of the start ({place})")
-    axis.set_ylabel("m north")

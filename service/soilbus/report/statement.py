@@ -6,7 +6,7 @@ Each depends on verdict, effects added, gap that remains and places of disagreem
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -53,14 +53,11 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def _named(addition: Addition) -> str:
-    """The name of an effect, or of the first of a set, as in "grade, lugs or one of 2 others"."""
+    """The name of an effect, or of the first of a set, as in "grade or lugs or one of 2 others"."""
     names = [addition.effect.name, *addition.alternatives]
     if addition.probability >= DEFAULT.named_probability or len(names) == 1:
         return names[0]
-    if len(names) == 2:
-        return " or ".join(names)
-    others = names[2] if len(names) == 3 else f"one of {len(names) - 2} others"
-    return f"{names[0]}, {names[1]} or {others}"
+    return " or ".join(names if len(names) <= 3 else [*names[:2], f"one of {len(names) - 2} others"])
 
 
 def plain_gap(diagnosis: Diagnosis) -> str:
@@ -76,13 +73,17 @@ def to_tell_apart(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
     """What to drive or measure next: a sentence, and a line for each effect."""
     sure = [addition.effect.name for addition in diagnosis.additions if not addition.alternatives]
     if sure:
-        yield f"What would confirm {'it' if len(sure) == 1 else 'them'}:", [f"{n}: {CATALOGUE[n].tells}" for n in sure]
+        yield f"What would confirm {'it' if len(sure) == 1 else 'them'}:", tells(sure)
     for addition in diagnosis.additions:
         if addition.alternatives:
-            names = [addition.effect.name, *addition.alternatives]
-            yield "What would tell these apart:", [f"{name}: {CATALOGUE[name].tells}" for name in names]
-    if hidden := [found.effect for found in diagnosis.detectable if found.size is None]:
-        yield "What these recordings could not show, and what would:", [f"{e.name}: {e.tells}" for e in hidden]
+            yield "What would tell these apart:", tells([addition.effect.name, *addition.alternatives])
+    if hidden := [found.effect.name for found in diagnosis.detectable if found.size is None]:
+        yield "What these recordings could not show, and what would:", tells(hidden)
+
+
+def tells(names: Iterable[str]) -> list[str]:
+    """What shows each effect, a line for each."""
+    return [f"{name}: {CATALOGUE[name].tells}" for name in names]
 
 
 def _found(diagnosis: Diagnosis, names: Sequence[str]) -> str:
