@@ -53,11 +53,12 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def _named(addition: Addition) -> str:
-    """The name of an effect, or of the first of a set, as in "grade or lugs or one of 2 others"."""
+    """The name of an effect, or of the first of a set, as in "grade, lugs or one of 2 others"."""
     names = [addition.effect.name, *addition.alternatives]
     if addition.probability >= DEFAULT.named_probability or len(names) == 1:
         return names[0]
-    return " or ".join(names if len(names) <= 3 else [*names[:2], f"one of {len(names) - 2} others"])
+    *most, last = names if len(names) <= 3 else [*names[:2], f"one of {len(names) - 2} others"]
+    return f"{', '.join(most)} or {last}"
 
 
 def plain_gap(diagnosis: Diagnosis) -> str:
