@@ -323,7 +323,9 @@ def identifiable(config: Config) -> dict[str, str]:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
         is_sure = len(forces) == 2
-        strength = f"{'yes' if is_sure else 'weakly'}: {', '.join(forces)}" if forces else "no: needs torque or draft"
+        strength = (
+            f"{'yes' if is_sure else 'weakly'}: {', '.join(forces)}" if forces else "no: needs torque or drawbar pull"
+        )
         depth = f"{'yes' if is_sure or sinkage else 'weakly'}: {', '.join([*forces, *['sinkage'] * sinkage])}"
         verdicts = {
             "k_c": "weakly: two tyre widths" if widths else "no: needs two tyre widths (prior kept)",

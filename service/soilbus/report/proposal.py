@@ -145,24 +145,16 @@ def proposal(
         if time:
             draft.put("time", time)
     _put_vehicle(draft)
-    layout = _layout_of(draft)
-    for axle in layout.axles:
+    axles, driven = _layout_of(draft)
+    for axle in axles:
         _put_axle(draft, axle)
     for axle, wheels in draft.axles.items():
         for wheel in wheels:
-            _put_wheel(draft, wheel, axle, layout)
+            _put_wheel(draft, wheel, axle, driven)
     _put_signals(draft)
     _put_rest(draft)
     text = toml_text(tomlkit.parse("\n".join(draft.lines) + "\n"))
     return Proposal(text, len(draft.used), draft.open)
-
-
-class _Layout(NamedTuple):
-    """Axles that have a section, "" for one motor of an unknown axle; wheels and axles with a torque."""
-
-    axles: tuple[str, ...]
-    wheels_driven: frozenset[str]
-    axles_driven: frozenset[str]
 
 
 def _one_layout(assignment: Assignment) -> Assignment:
@@ -178,26 +170,21 @@ def _one_layout(assignment: Assignment) -> Assignment:
     return Assignment(asserted, left, assignment.rivals, assignment.unnamed)
 
 
-def _layout_of(draft: _Draft) -> _Layout:
+def _layout_of(draft: _Draft) -> tuple[list[str], set[str]]:
+    """Axles that have a section, "" for one motor of an unknown axle; places of the torques."""
     asserted = draft.assignment.asserted
     at = {place for role, place in asserted if role == "torque"}
     if not at:  # one open candidate for each axle, or one for the vehicle: motors of axles all the same
         own = {slot.place: cs for slot, cs in draft.assignment.open.items() if slot.role == "torque"}
         if own.keys() <= {"", *AXLES} and all(len(cs) == 1 for cs in own.values()):
             at = set(own)
+    if "" in at and draft.facts.axle:
+        at = {draft.facts.axle}
     loads = {place for role, place in asserted if role == "load" and place in AXLES}
     if all(draft.matched("load", wheel) for wheels in draft.axles.values() for wheel in wheels):
         loads = set()  # one measurement, not two
-    driven = at & set(AXLES)
     named = set(draft.axles) if len(draft.axles) > 2 else set()
-    axles = [axle for axle in AXLES if axle in driven | loads | named]
-    if "" in at:
-        if draft.facts.axle:
-            driven = {draft.facts.axle}
-            axles = [axle for axle in AXLES if axle in driven | loads | named]
-        else:
-            axles.append("")
-    return _Layout(tuple(axles), frozenset(at & WHEELS), frozenset(driven))
+    return [axle for axle in AXLES if axle in at | loads | named] + [""] * ("" in at), at
 
 
 def _put_vehicle(draft: _Draft) -> None:
@@ -252,7 +239,7 @@ def _put_axle(draft: _Draft, axle: str) -> None:
         draft.put_signal("load", load)
 
 
-def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
+def _put_wheel(draft: _Draft, wheel: str, axle: str, driven: set[str]) -> None:
     draft.section("wheel", repeated=True)
     draft.put("name", wheel)
     draft.put("axle", axle)
@@ -262,13 +249,13 @@ def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
     draft.put_open("width", "m, of the tyre")
     torque, speed = draft.matched("torque", wheel), draft.matched("speed", wheel)
     motor = draft.matched("motor_speed", wheel)
-    by_axle = bool(layout.axles_driven & {axle, "both"})
+    by_axle = bool(driven & {axle, "both"})
     if motor is not None or (torque is not None and not _is_at_wheel(torque)):
         _put_gear(draft, wheel)
     if torque is not None:
         draft.put_signal("torque", torque)
         _put_limit(draft, torque, "wheel")
-    elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
+    elif not by_axle and driven:
         draft.put_open("driven", "true or false: no torque of it was found")
     elif not by_axle:
         known = _of_role(draft, "torque", wheel)
