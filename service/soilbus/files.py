@@ -27,7 +27,7 @@ from itertools import count
 from pathlib import Path
 from typing import IO, Any
 
-from soilbus.words import shown
+from soilbus.words import WorkError, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +251,7 @@ def _closing(descriptor: int) -> Iterator[int]:
         os.close(descriptor)
 
 
-class NotWritten(Exception):
+class NotWritten(WorkError):
     """Error of a file that cannot be written; the text is one line for the user."""
 
     def __init__(self, text: str) -> None:

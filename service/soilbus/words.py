@@ -12,6 +12,10 @@ LONGEST_NAME = 300
 """Characters of a name that are shown: more than a file's name may have on usual file systems (NAME_MAX, 255)."""
 
 
+class WorkError(Exception):
+    """Error of work that could not be done; the text is one line for the user."""
+
+
 def shown(text: object, most: int = LONGEST_LINE) -> str:
     """Return a text as one line: unprintable characters by their codes, the middle of a long one cut out.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.cli.reference import pages
+from reference_pages import pages
 from soilbus.config.model import Config
 from soilbus.terra.effects.catalogue import CATALOGUE
 
@@ -23,7 +23,7 @@ PAGES = [
 @pytest.mark.parametrize("name", sorted(pages()))
 def test_a_generated_page_is_up_to_date(name: str) -> None:
     wanted = pages()[name]
-    assert (DOCS / name).read_text(encoding="utf-8") == wanted, "python -m soilbus.cli.reference service/docs"
+    assert (DOCS / name).read_text(encoding="utf-8") == wanted, "python tests/support/reference_pages.py service/docs"
 
 
 def test_every_key_and_effect_has_its_row() -> None:

@@ -255,17 +255,6 @@ def test_no_negative_draft_is_said_to_be_possible(desk):
     assert desk.dashboard.sentences()[2] == "Draft 1.6 kN of 0.0 kN"
 
 
-@pytest.mark.parametrize("state", ["go", "caution"])
-def test_a_slip_above_the_best_gets_a_word_beside_go_and_a_held_caution(desk, state):
-    said = {}
-    for slip in (0.1, 0.4):
-        desk.send("Traversability", State=state, LimitingCause="slip", Probability=0.97)
-        desk.send("WheelSlip", SlipWheel1=slip)
-        desk.send("TractionAdvice", **WHOLE["TractionAdvice"] | {"Status": "valid"})
-        said[slip] = "slip above best" in desk.dashboard.verdict().todo
-    assert said == {0.1: False, 0.4: True}
-
-
 @pytest.mark.parametrize("warning", ["none", "immobilisation"])
 @pytest.mark.parametrize("state", ["caution", "no_go"])
 def test_a_vehicle_that_pulls_nothing_is_not_told_to_lift_or_to_reduce_the_draft(desk, state, warning):
@@ -605,12 +594,3 @@ def test_a_draft_that_no_sensor_shows_is_why_a_good_estimate_gives_no_state(desk
     desk.send("SoilbusStatus", State="valid", Reason="none", Window=7)
     desk.send("PresentDemand", Draft=draft)
     assert desk.dashboard.verdict().said == said
-
-
-def test_a_draft_that_was_shown_is_not_said_to_have_no_sensor(desk):
-    desk.send("Traversability", State="unknown")
-    desk.send("SoilbusStatus", State="valid", Reason="none", Window=7)
-    for draft in (1200.0, None):
-        desk.clock.now += 0.2
-        desk.send("PresentDemand", Draft=draft)
-    assert desk.dashboard.verdict().said == "UNKNOWN: the draft is not heard any more"

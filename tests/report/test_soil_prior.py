@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import lognorm
 
 from soilbus.cli.main import main
-from soilbus.report.soil_prior import prior_text
+from soilbus.report.configuration import prior_text
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.terra.soils import KINDS, SOILS
 

@@ -47,23 +47,13 @@ class SingleWheelRig:
 
     Attributes
     ----------
-    radius, width
-        Of the wheel [m].
     noise
-        Standard deviation of each column (wheel_load, slip, drawbar_pull, torque, sinkage) in SI, or a mapping with
-        `absolute`, `relative`, `of_mean` and `gain` as in [noise] of a configuration, whose defaults hold for others.
+        Standard deviation of each column in SI, or a mapping as in [noise] of a configuration, whose defaults hold for
+        others.
     soil
         Prior (value, std) of soil parameters in SI, std = 0 holds one; by default that of a configuration.
-    tyre
-        "rigid", or "flexible" for a wheel with a tyre.
-    shear_law
-        "exponential" (Janosi & Hanamoto) or "rational".
-
-    Examples
-    --------
-    >>> rig = SingleWheelRig(radius=0.3, width=0.2, noise={"torque": 3.0, "wheel_load": {"relative": 0.01}})
-    >>> rig.configuration(["wheel_load", "slip", "torque"]).noise.torque.absolute
-    3.0
+    tyre, shear_law
+        "rigid" or "flexible"; "exponential" (Janosi & Hanamoto) or "rational".
     """
 
     radius: float
@@ -76,12 +66,7 @@ class SingleWheelRig:
     def configuration(self, columns: Iterable[str]) -> Config:
         """Return the configuration of this rig for a table with columns named by their roles.
 
-        Raises
-        ------
-        TableError
-            wheel_load or slip is missing, or a name is nearly one of a role that is.
-        ConfigError
-            A value that the configuration does not take, or a column without noise.
+        TableError where a column is missing or misspelt, ConfigError where a value cannot be used.
         """
         names = list(columns)
         absent = [role for role in ROLES if role not in names]
@@ -104,28 +89,12 @@ class SingleWheelRig:
 
 @dataclass(frozen=True, repr=False)
 class SoilEstimate:
-    """The soil that rows of a test rig determine; prints itself as a report.
+    """The soil that rows of a test rig determine; prints itself as a report. Values are SI.
 
-    Attributes
-    ----------
-    posterior
-        Log-normal, of all six parameters.
-    prior
-        Value and std of each parameter beforehand, SI.
-    bearing_pressure
-        (k_c/b_ref + k_phi) z_ref^n [Pa], the combination that data determine best.
-    z_ref, b_ref
-        Depth and plate width [m] that it holds for.
-    status, reason
-        As of a window of `soilbus replay`: `valid`, `degraded`, `not_excited`.
-    chi2
-        Reduced chi-square: 1 where model and noise describe the data.
-    rows
-        Used.
-    left_out
-        Rows that were not, by reason.
-    readings
-        Of each channel the rows' load, slip, measured and modelled values, SI.
+    `posterior` is log-normal, of all six parameters; `prior` value and std of each beforehand; `bearing_pressure`
+    (k_c/b_ref + k_phi) z_ref^n [Pa], what data determine best, at a depth z_ref under a plate b_ref wide [m]. `status`
+    and `reason` are as of a window of `soilbus replay`; `chi2` is reduced: 1 where model and noise describe the data.
+    `left_out` are rows by reason; `readings` the rows of `residuals`.
     """
 
     posterior: Posterior
@@ -138,18 +107,12 @@ class SoilEstimate:
     chi2: float | None
     rows: int
     left_out: Mapping[str, int]
-    readings: Mapping[str, tuple[Array, Array, Array, Array]] = field(default_factory=dict)
+    readings: Sequence[Mapping[str, Any]] = ()
 
     @property
     def residuals(self) -> Any:
         """pandas DataFrame: channel, slip, load, measured, modelled and residual of each row, SI."""
-        return frame_of(
-            [
-                {"channel": channel, "slip": s, "load": w, "measured": y, "modelled": m, "residual": y - m}
-                for channel, (load, slip, measured, modelled) in self.readings.items()
-                for w, s, y, m in zip(load, slip, measured, modelled, strict=True)
-            ]
-        )
+        return frame_of(self.readings)
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame: value, std and prior of each parameter, SI."""
@@ -220,50 +183,38 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     Parameters
     ----------
     data
-        Columns of equal length by name, each row one steady state: a mapping of arrays or a pandas DataFrame. Of a
-        SingleWheelRig the names are wheel_load [N] and slip [1] with at least one of drawbar_pull [N], torque [N m]
-        and sinkage [m], and optionally t [s] and run; others are not used. nan and None are missing.
+        Columns of equal length by name (mapping or pandas DataFrame), a steady state a row: of a SingleWheelRig
+        wheel_load [N] and slip [1] with at least one of drawbar_pull [N], torque [N m] and sinkage [m], and optionally
+        t [s] and run. nan and None are missing.
     rig
         The rig; or a configuration with a [table] that maps the columns, or the path of one.
     run
         Soil bed to estimate, where the data hold several.
 
-    Returns
-    -------
-    SoilEstimate
-
     Raises
     ------
-    TableError
-        A column is missing, a cell is not a number, no row can be used, or no soil bed is named `run`, or `run` is
-        None and there are several.
-    ConfigError
-        The rig's values cannot be used.
-    NotFitted
-        No soil describes the rows.
+    TableError, ConfigError, NotFitted
+        Columns or rows, or the soil bed, cannot be used; the rig's values cannot; no soil describes the rows.
 
     Examples
     --------
-    A wheel of 0.3 m radius at two loads and ten slips on a soil that we choose, without noise:
-
-    >>> import numpy as np
     >>> import soilbus
-    >>> slip, load = (a.ravel() for a in np.meshgrid(np.linspace(0.05, 0.6, 10), [800.0, 1500.0]))
+    >>> load, slip = [800.0] * 8 + [1500.0] * 8, [0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6] * 2
     >>> true = soilbus.wheel_forces("loam", load, slip, radius=0.3, width=0.2)
     >>> columns = {"wheel_load": load, "slip": slip, "drawbar_pull": true.drawbar_pull, "torque": true.torque}
     >>> rig = soilbus.SingleWheelRig(0.3, 0.2, noise={"drawbar_pull": 8.0, "torque": 3.0})
     >>> found = soilbus.estimate(columns, rig)
-    >>> found.status
-    'valid'
-    >>> soil = soilbus.soil_named("loam")
-    >>> all(abs(found.values[name] - true) < 2.0 * found.std[name] for name, true in soil._asdict().items())
+    >>> abs(found.values["phi"] - soilbus.soil_named("loam").phi) < 2.0 * found.std["phi"]
     True
     """
     columns = {str(name): np.asarray(data[name]).tolist() for name in data}
     lengths = {len(cells) for cells in columns.values() if isinstance(cells, list)}
     if len(lengths) > 1 or not all(isinstance(cells, list) for cells in columns.values()):
         raise TableError(f"{SOURCE}: its columns are not of one length")
-    config = _configuration(rig, columns)
+    if isinstance(rig, SingleWheelRig):
+        config = rig.configuration(columns)
+    else:
+        config = rig if isinstance(rig, Config) else load_config(rig)
     found = _of_bed(runs_of_columns(config, columns, SOURCE), run)
     (result,) = replay_runs(config, [found])
     bearing = result.bearing
@@ -285,8 +236,8 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     )
 
 
-def _readings(config: Config, found: Run, soil: Soil) -> dict[str, tuple[Array, Array, Array, Array]]:
-    """Load, slip, measured and modelled values of each channel; the wheel runs with the configured effects."""
+def _readings(config: Config, found: Run, soil: Soil) -> list[dict[str, Any]]:
+    """Each channel's rows beside the model's values; the wheel runs with the configured effects."""
     window, wheel = found.window, config.wheel[0]
     load, slip = window.load[:, 0], slip_ratio(wheel.radius, window.speed[:, 0], window.ground_speed)
     effects = {
@@ -302,17 +253,12 @@ def _readings(config: Config, found: Run, soil: Soil) -> dict[str, tuple[Array, 
         "torque": (window.torque[:, 0], modelled.torque),
         "sinkage": (window.sinkage[:, 0], modelled.sinkage),
     }
-    return {
-        name: (load[known], slip[known], measured[known], values[known])
-        for name, (measured, values) in both.items()
-        if (known := np.isfinite(measured)).any()
-    }
-
-
-def _configuration(rig: SingleWheelRig | Config | Path | str, columns: Iterable[str]) -> Config:
-    if isinstance(rig, SingleWheelRig):
-        return rig.configuration(columns)
-    return rig if isinstance(rig, Config) else load_config(rig)
+    return [
+        {"channel": channel, "slip": s, "load": w, "measured": y, "modelled": m, "residual": y - m}
+        for channel, (measured, values) in both.items()
+        for w, s, y, m in zip(load, slip, measured, values, strict=True)
+        if np.isfinite(y)
+    ]
 
 
 def _of_bed(runs: Sequence[Run], bed: str | None) -> Run:
@@ -345,7 +291,5 @@ def _quantity(found: Estimate, unit: float) -> str:
 def _plus_minus(found: Estimate, unit: float) -> str:
     """Value and std with two digits of the std."""
     value, std = found.value / unit, found.std / unit
-    if std == 0.0:
-        return f"{value:.4g}"
-    decimals = max(1 - math.floor(math.log10(std)), 0)
-    return f"{value:.{decimals}f} +/- {std:.{decimals}f}"
+    decimals = max(1 - math.floor(math.log10(std)), 0) if std else 0
+    return f"{value:.{decimals}f} +/- {std:.{decimals}f}" if std else f"{value:.4g}"

@@ -1,4 +1,20 @@
-"""Recordings: replayed to a table of windows, diagnosed, simulated."""
+"""Recordings: simulated, replayed to a table of windows, diagnosed.
+
+A configuration may be the path of one; logs are a file, a pandas DataFrame, or several of them.
+
+>>> from tempfile import TemporaryDirectory
+>>> import soilbus
+>>> from soilbus.simulator.reference import TRACTOR
+>>> with TemporaryDirectory() as folder:
+...     log = f"{folder}/drive.log"
+...     drive = soilbus.simulate(log, TRACTOR, duration=40.0, effects={"slip_sinkage": 0.5})
+...     windows, samples = soilbus.replay(log, TRACTOR), soilbus.signals(log, TRACTOR)
+...     found = soilbus.diagnose(log, TRACTOR)
+>>> drive.truth["ground_speed"].shape, samples.attrs["units"]["draft"], windows["status"].iloc[-1]
+((2000,), 'N', 'valid')
+>>> found
+an effect is missing, and the data tell which: slip_sinkage (gap 2.06 -> 0.95)
+"""
 
 from __future__ import annotations
 
@@ -19,7 +35,7 @@ from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.estimation.assembly import with_effects
-from soilbus.files import whole_file
+from soilbus.files import write_text
 from soilbus.offline.diagnose import Findings, diagnose_logs
 from soilbus.offline.replay import fed
 from soilbus.offline.replay import replay as replay_logs
@@ -39,47 +55,21 @@ __all__ = ["Diagnosis", "diagnose", "replay", "signals", "simulate"]
 
 PathLike = Path | str
 Logs = Any
-"""A file, a pandas DataFrame, or several of them."""
 
 
 def replay(log: Logs, config: Config | PathLike) -> Any:
     """Return the service's own windows over recorded logs, or over tables of a test rig.
 
-    Parameters
-    ----------
-    log
-        File or files: every log that `soilbus replay` reads, CSV and Parquet where the configuration has [table]; CSV,
-        Parquet, MF4 or a pandas DataFrame of signals over time where it has [columns].
-    config
-        Configuration, or the path of one.
-
     Returns
     -------
     pandas.DataFrame or list of dict
-        A row for each window in SI units, columns as in docs/json.md with dots between the keys: `t`, `status`,
-        `soil.phi.value`, `bearing_pressure.std`, `slip.FL`. A list of rows, None where not known, where pandas is not
-        installed.
+        A row for each window in SI units, columns as in docs/json.md with dots between the keys: `soil.phi.value`. A
+        list of rows, None where not known, where pandas is not installed.
 
     Raises
     ------
-    LogError
-        A log or table cannot be read, or not to its end.
-    ConfigError
-        The configuration cannot be used.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import soilbus
-    >>> from soilbus.simulator.reference import TRACTOR
-    >>> with TemporaryDirectory() as folder:
-    ...     _ = soilbus.simulate(f"{folder}/drive.log", TRACTOR, soil="loam", duration=12.0)
-    ...     windows = soilbus.replay(f"{folder}/drive.log", TRACTOR)
-    >>> windows["status"].tolist()
-    ['valid', 'valid']
-    >>> last = windows.iloc[-1]
-    >>> bool(abs(last["soil.phi.value"] - soilbus.soil_named("loam").phi) < 2.0 * last["soil.phi.std"])
-    True
+    LogError, ConfigError
+        A log or table cannot be read to its end; the configuration cannot be used.
     """
     used = _config(config)
     with _paths(log) as paths:
@@ -95,15 +85,7 @@ def replay(log: Logs, config: Config | PathLike) -> Any:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis:
-    """What the model misses in recordings; prints itself as one sentence.
-
-    Attributes
-    ----------
-    findings
-        The diagnosis with the recordings it was made from.
-    path
-        Of the configuration; None where it came without.
-    """
+    """What the model misses in recordings, with the path of the configuration; prints itself as one sentence."""
 
     findings: Findings
     path: Path | None = None
@@ -165,57 +147,25 @@ class Diagnosis:
     def write_model(self, out: PathLike) -> None:
         """Write the configuration with the effects found added, as `soilbus diagnose --model-out` does.
 
-        Raises
-        ------
-        ValueError
-            The diagnosis was made with a configuration that is not from a file.
-        OSError
-            `out` cannot be written.
+        ValueError where it was not read from a file.
         """
         if self.path is None:
             raise ValueError("diagnose() was given a configuration without its file: give the path of the TOML file")
         out = Path(out)
         effects, notes = effect_tables(self.findings.diagnosis.completed)
         text = with_effects_text(self.path, [], effects, out.parent, notes)
-        with whole_file(out) as file:
-            file.write(text)
+        write_text(out, text)
 
 
 def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:
     """Find what the model misses in logs, or in tables of a test rig, and name it.
 
-    Parameters
-    ----------
-    logs
-        File or files, diagnosed together: each has its own soil, sensors and effects are the same in all.
-    config
-        Configuration, or the path of one.
-
-    Returns
-    -------
-    Diagnosis
+    Logs are diagnosed together: each has its own soil, sensors and effects are the same in all.
 
     Raises
     ------
-    LogError, TooLittle
-        A log or table cannot be read, or holds too little.
-    NotFitted
-        The present model cannot be fitted.
-    ConfigError
-        The configuration cannot be used.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import soilbus
-    >>> from soilbus.simulator.reference import TRACTOR
-    >>> with TemporaryDirectory() as folder:
-    ...     _ = soilbus.simulate(f"{folder}/drive.log", TRACTOR, duration=40.0, effects={"slip_sinkage": 0.5})
-    ...     found = soilbus.diagnose(f"{folder}/drive.log", TRACTOR)
-    >>> found.verdict, list(found.effects)
-    ('named', ['slip_sinkage'])
-    >>> found
-    an effect is missing, and the data tell which: slip_sinkage (gap 2.06 -> 0.95)
+    LogError, TooLittle, NotFitted, ConfigError
+        A log cannot be read or holds too little; the present model cannot be fitted; the configuration cannot be used.
     """
     path = None if isinstance(config, Config) else found_configuration(str(config))
     with _paths(logs) as paths:
@@ -223,14 +173,7 @@ def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:
 
 
 def signals(log: Logs, config: Config | PathLike) -> Any:
-    """Return the decoded and admitted samples of every mapped signal.
-
-    Parameters
-    ----------
-    log
-        One recording, as of `replay`.
-    config
-        Configuration, or the path of one.
+    """Return the decoded and admitted samples of every mapped signal of one recording.
 
     Returns
     -------
@@ -240,21 +183,8 @@ def signals(log: Logs, config: Config | PathLike) -> Any:
 
     Raises
     ------
-    LogError, ConfigError
-        As `replay`.
-    ValueError
-        Several logs, or a configuration of a test rig, whose tables hold no signals over time.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import soilbus
-    >>> from soilbus.simulator.reference import TRACTOR
-    >>> with TemporaryDirectory() as folder:
-    ...     drive = soilbus.simulate(f"{folder}/drive.log", TRACTOR, duration=5.0)
-    ...     frame = soilbus.signals(f"{folder}/drive.log", TRACTOR)
-    >>> frame.attrs["units"]["draft"], int(frame["draft [N]"].count())
-    ('N', 250)
+    LogError, ConfigError, ValueError
+        As `replay`; several logs, or a configuration of a test rig, whose tables hold no signals over time.
     """
     used = _config(config)
     if used.table is not None:
@@ -291,17 +221,12 @@ def simulate(
     ----------
     log
         File that gets the frames; its name's end picks the format. None for none.
-    config
-        The vehicle, or the path of its configuration; by default the reference tractor.
-    soil
-        Name of a known soil, or of several, each for an equal part of the time.
-    duration
-        [s].
+    soil, duration
+        Known soils by name, each for an equal part of the time [s].
     effects
-        Values of effects that are there and that the service does not know of: {"slip_sinkage": 0.4,
-        "hardpan.depth": 0.05}; a name alone is the effect's first parameter.
+        Effects that are there and that the service does not know of: {"slip_sinkage": 0.4, "hardpan.depth": 0.05}.
     seed
-        Picks slips, loads, noise and gain errors; the same seed gives the same recording.
+        Picks slips, loads, noise and gain errors.
 
     Returns
     -------
@@ -310,21 +235,8 @@ def simulate(
 
     Raises
     ------
-    SimulationError
-        The vehicle cannot drive there.
-    KeyError
-        No such soil.
-    ConfigError
-        The configuration cannot be used, or no effect is so named.
-    OSError, ValueError
-        The log cannot be written, or its format is unknown.
-
-    Examples
-    --------
-    >>> import soilbus
-    >>> drive = soilbus.simulate(soil="wet_clay", duration=5.0)
-    >>> drive.truth["ground_speed"].shape
-    (250,)
+    SimulationError, KeyError, ConfigError, OSError, ValueError
+        The vehicle cannot drive there; no such soil; no such effect; the log cannot be written, or has no known format.
     """
     used = with_effects(_config(config), [f"{name}={value}" for name, value in (effects or {}).items()])
     recording = simulate_drive(used, scenario_over([soil] if isinstance(soil, str) else soil, duration), seed)

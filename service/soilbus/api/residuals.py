@@ -39,17 +39,7 @@ def blank_figure(width: float, height: float) -> Any:
 
 
 def plot_residuals(residuals: Any) -> Any:
-    """Return a figure of matplotlib: measured over modelled, and residuals over slip and load, by channel.
-
-    Parameters
-    ----------
-    residuals
-        DataFrame with channel, measured, modelled, residual, slip, load.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Return a figure of matplotlib: measured over modelled, and residuals over slip and load, by channel."""
     channels = list(dict.fromkeys(residuals["channel"]))
     figure = blank_figure(10.0, 3.0 * len(channels))
     for row, channel in zip(figure.subplots(len(channels), 3, squeeze=False), channels, strict=True):

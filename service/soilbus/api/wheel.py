@@ -28,20 +28,9 @@ NOT_ALONE = frozenset({"multipass", "inertia"})
 
 @dataclass(frozen=True, slots=True)
 class WheelForces:
-    """Forces and place of a wheel; floats, or arrays of the shape that the inputs broadcast to.
+    """Load W [N], drawbar pull [N], torque [N m], entry angle [rad] from the vertical and sinkage [m] of a wheel.
 
-    Attributes
-    ----------
-    load
-        W [N].
-    drawbar_pull
-        DP [N], positive where the wheel pulls.
-    torque
-        T [N m] about the axle.
-    entry_angle
-        theta_1 [rad] from the vertical.
-    sinkage
-        z [m].
+    Floats, or arrays of the shape that the inputs broadcast to.
     """
 
     load: Any
@@ -72,16 +61,13 @@ def wheel_forces(
         W [N]; None where the sinkage is given.
     slip
         1 - V/(r omega); negative where the wheel brakes.
-    radius, width
-        r and b [m].
-    sinkage
-        z [m] in place of the load.
+    radius, width, sinkage
+        r, b and, in place of the load, z [m].
     model
-        Shear law, "exponential" (Janosi & Hanamoto) or "rational" (Xi et al. 2024), or all choices of the wheel-soil
-        model.
+        Shear law, "exponential" (Janosi & Hanamoto) or "rational" (Xi et al. 2024), or a whole wheel-soil model.
     effects
-        Values of effects of the catalogue (docs/effects.md) that act on a wheel on any ground, steadily at 1 m/s:
-        {"slip_sinkage": 0.4, "hardpan.depth": 0.05}; a name alone is the effect's first parameter.
+        Values of effects (docs/effects.md) that act on a single wheel, steadily at 1 m/s: {"slip_sinkage": 0.4,
+        "hardpan.depth": 0.05}; a name alone is the effect's first parameter.
 
     Returns
     -------
@@ -91,28 +77,16 @@ def wheel_forces(
     Raises
     ------
     ValueError
-        No such soil, shear law or effect; load and sinkage both given, or neither, or a sinkage with effects; a radius
-        or width that is not above 0; a load below 0; a slip above 1; a sinkage that no wheel of this radius rolls at.
+        No such soil, shear law or effect, not one of load and sinkage, or a value that no wheel has.
 
     Examples
     --------
     >>> import soilbus
     >>> at = soilbus.wheel_forces("loam", 6000.0, [0.1, 0.2, 0.3], radius=0.5, width=0.3)
-    >>> at.drawbar_pull.round()  # N
-    array([ 215.,  734., 1063.])
-    >>> (1e3 * at.sinkage).round()  # mm
-    array([45., 45., 44.])
-
-    The other way round, from a measured sinkage to the load:
-
+    >>> at.drawbar_pull.round(), (1e3 * at.sinkage).round()  # N, mm
+    (array([ 215.,  734., 1063.]), array([45., 45., 44.]))
     >>> round(soilbus.wheel_forces("loam", None, 0.2, radius=0.5, width=0.3, sinkage=0.05).load)
     6860
-
-    A wheel that digs where it slips:
-
-    >>> digs = soilbus.wheel_forces("loam", 6000.0, 0.3, radius=0.5, width=0.3, effects={"slip_sinkage": 0.4})
-    >>> round(1e3 * digs.sinkage), round(digs.drawbar_pull)  # mm, N
-    (49, 1057)
     """
     soil = _soil(soil)
     model = _model(model)

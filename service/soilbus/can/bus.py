@@ -21,7 +21,7 @@ from soilbus.can.bus_state import BusState, state_told, tells_overflow
 from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
 from soilbus.can.wire import MessageBus, MessageWire, Received, error_number, is_multicast, wire_of
-from soilbus.words import one_line
+from soilbus.words import WorkError, one_line
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ _NO_ROOM = {errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK}
 _KERNEL_WITHOUT_CAN = {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT}
 
 
-class BusError(Exception):
+class BusError(WorkError):
     """The bus cannot be opened; `may_come` tells whether waiting can help."""
 
     def __init__(self, text: str, may_come: bool) -> None:

@@ -17,7 +17,7 @@ from statistics import median
 from soilbus.can.candump import Batch, Frame
 from soilbus.can.log_formats import HEAD, Format, format_of
 from soilbus.files import opened, packing, within_ratio
-from soilbus.words import one_line, shown
+from soilbus.words import WorkError, one_line, shown
 
 CHANNEL_SCAN_FRAMES = 2000
 """Frames of a log in which its channels are looked for: several seconds of a bus."""
@@ -29,7 +29,7 @@ LEAST_STAMPS = 20
 """Frames from which stamps are judged."""
 
 
-class LogError(Exception):
+class LogError(WorkError):
     """Error of a log that cannot be read to its end; `windows` ended before the damage.
 
     `lasting` is False where the fault is of the machine that reads it, not of what is in the log.

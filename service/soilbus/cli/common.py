@@ -8,22 +8,16 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from soilbus.config.file import found_configuration, load_config
+from soilbus.config.model import Config
 from soilbus.files import write_text
-
-if TYPE_CHECKING:
-    from soilbus.config.model import Config
-
-
-class WorkError(Exception):
-    """Error of work that could not be done; the text is one line for the user."""
+from soilbus.words import WorkError
 
 
 def configured(args: argparse.Namespace) -> Config:
     """Return the configuration that --config and --set name, or soilbus.toml in the current folder."""
-    from soilbus.config.file import found_configuration, load_config
-
     config = load_config(found_configuration(args.config), args.set)
     return config.model_copy(update={"log_channel": getattr(args, "channel", None)})
 
@@ -35,11 +29,11 @@ def configured_or_reference(args: argparse.Namespace) -> Config:
     return configured(args) if args.config else reference_configuration(args.set)
 
 
-def need_extra(module: str, extra: str, what: str) -> None:
-    """Raise WorkError where the module of an extra is not installed."""
+def need_extra(extra: str, what: str, *modules: str) -> None:
+    """Raise WorkError where a module of an extra is not installed."""
     from importlib.util import find_spec
 
-    if find_spec(module) is None:
+    if not all(map(find_spec, modules)):
         raise WorkError(f"{what} needs the extra soilbus[{extra}]")
 
 

@@ -1,18 +1,31 @@
-"""The catalogue of effects as rows, text and JSON: what `soilbus effects` and the page effects.md show."""
+"""`soilbus effects`: the catalogue of effects as rows, text and JSON."""
 
 from __future__ import annotations
 
+import argparse
 import textwrap
 from collections.abc import Iterable
 from typing import Any
 
+from soilbus.cli.common import report
+from soilbus.config.model import ConfigError
 from soilbus.report.table import table
+from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
+from soilbus.words import did_you_mean
 
 WIDTH = 100
 """Characters of a line."""
 HEAD = ("parameter", "unit", "absent at", "prior std", "range")
 """Of each column of parameter_rows()."""
+
+
+def effects(args: argparse.Namespace) -> None:
+    """Run `soilbus effects`: the catalogue, or one effect in full."""
+    if args.name is not None and args.name not in CATALOGUE:
+        raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
+    wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
+    report(args.json, effect_records(wanted), effect_text(wanted[0]) if args.name else overview(wanted))
 
 
 def parameter_rows(effect: Effect) -> list[tuple[str, ...]]:
@@ -24,9 +37,9 @@ def parameter_rows(effect: Effect) -> list[tuple[str, ...]]:
 
 def effect_text(effect: Effect) -> str:
     """Return one effect in full, as text."""
-    parts = [f"{effect.name}\n", _wrapped(effect.physics), table(HEAD, parameter_rows(effect))]
-    parts += [_wrapped(f"Shown by: {effect.tells}"), _wrapped(f"Source: {effect.source}")]
-    return "\n".join(parts)
+    physics, *texts = effect.physics, f"Shown by: {effect.tells}", f"Source: {effect.source}"
+    parts = [effect.name, textwrap.fill(physics, WIDTH), table(HEAD, parameter_rows(effect)).rstrip("\n")]
+    return "\n\n".join([*parts, *(textwrap.fill(text, WIDTH) for text in texts)]) + "\n"
 
 
 def overview(effects: Iterable[Effect]) -> str:
@@ -51,7 +64,3 @@ def effect_records(effects: Iterable[Effect]) -> list[dict[str, Any]]:
         }
         for effect in effects
     ]
-
-
-def _wrapped(text: str) -> str:
-    return textwrap.fill(text, WIDTH) + "\n"

@@ -12,15 +12,15 @@ from importlib import import_module
 
 from soilbus.allocator import loading
 from soilbus.cli.arguments import command_line
-from soilbus.cli.common import WorkError
-from soilbus.files import NotWritten
 from soilbus.process import output_fault, say
+from soilbus.words import WorkError
 
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = {
     "user": ("demo", "init", "run", "check", "watch", "completion", "docs"),
-    "engineer": ("replay", "simulate", "diagnose", "effects", "batch"),
+    "engineer": ("replay", "simulate", "diagnose", "batch"),
+    "effects": ("effects",),
     "trials": ("paper", "decisions", "bench"),
 }
 """Each file of commands, loaded when one of them is asked for; a command is the function of that name."""
@@ -35,14 +35,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with loading():
         from soilbus.config.model import ConfigError
     try:
-        file = next(file for file, commands in COMMANDS.items() if args.command in commands)
-        getattr(import_module(f"soilbus.cli.{file}"), args.command)(args)
+        with loading():
+            file = next(file for file, commands in COMMANDS.items() if args.command in commands)
+            module = import_module(f"soilbus.cli.{file}")
+        getattr(module, args.command)(args)
         sys.stdout.flush()
     except ConfigError as error:
         for fault in error.faults:
             say(fault)
         return WRONG_USAGE
-    except (WorkError, NotWritten) as error:
+    except WorkError as error:
         say(str(error))
         return FAILED
     except KeyboardInterrupt:

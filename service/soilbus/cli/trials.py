@@ -9,8 +9,10 @@ import argparse
 import os
 from contextlib import nullcontext
 
-from soilbus.cli.common import WorkError, configured_or_reference, report
+from soilbus.cli.common import configured_or_reference, report
+from soilbus.config.model import ConfigError
 from soilbus.files import whole_file
+from soilbus.words import WorkError
 
 
 def paper(args: argparse.Namespace) -> None:
@@ -22,8 +24,6 @@ def paper(args: argparse.Namespace) -> None:
 
 def decisions(args: argparse.Namespace) -> None:
     """Run `soilbus decisions`: predictions beside what simulated drives then do."""
-    from soilbus.config.model import ConfigError
-    from soilbus.simulator.drive import SimulationError
     from soilbus.trials.bogging_trials import warning_trials
     from soilbus.trials.decisions_report import as_json, decisions_report
     from soilbus.trials.draft_trials import draft_trials
@@ -33,13 +33,10 @@ def decisions(args: argparse.Namespace) -> None:
     config = configured_or_reference(args)
     if config.tows_nothing:
         raise ConfigError(['vehicle.towing = "never": decisions are tried by drafts, which this vehicle never has'])
-    try:
-        with processes(os.cpu_count() or 1) as each:
-            drafts = list(draft_trials(config, args.drives, args.seed, each=each))
-            calls = verdict_trials(config, args.calls, args.seed, each=each)
-            warnings = warning_trials(config, args.boggings, args.hours, args.seed, each=each)
-    except SimulationError as error:
-        raise WorkError(str(error)) from None
+    with processes(os.cpu_count() or 1) as each:
+        drafts = list(draft_trials(config, args.drives, args.seed, each=each))
+        calls = verdict_trials(config, args.calls, args.seed, each=each)
+        warnings = warning_trials(config, args.boggings, args.hours, args.seed, each=each)
     report(args.json, as_json(drafts, calls, warnings), decisions_report(drafts, calls, warnings))
 
 

@@ -17,16 +17,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import WorkError, check_outputs, configured, configured_or_reference, need_extra
+from soilbus.cli.common import check_outputs, configured, configured_or_reference, need_extra
+from soilbus.config.model import Config, ConfigError
 from soilbus.files import write_text
 from soilbus.process import ENDING, say
+from soilbus.words import WorkError
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
     from soilbus.can.candump import Frame
     from soilbus.can.logs import Log
-    from soilbus.config.model import Config
     from soilbus.offline.columns import SignalTable
     from soilbus.sensors.survey import Survey
 
@@ -42,11 +43,10 @@ def demo(args: argparse.Namespace) -> None:
 def init(args: argparse.Namespace) -> None:
     """Run `soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
     from soilbus.can.dbc_files import load_databases
-    from soilbus.can.logs import Log, LogError
+    from soilbus.can.logs import Log
     from soilbus.can.role_matching import assigned, candidates
     from soilbus.config.edit import named_from
     from soilbus.config.file import located, parse_config
-    from soilbus.config.model import ConfigError
     from soilbus.report.progress import progress
     from soilbus.report.proposal import proposal
     from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
@@ -69,15 +69,10 @@ def init(args: argparse.Namespace) -> None:
                 log = Log(args.log, args.channel or "", demanded=True)
     except ConfigError as error:
         raise ConfigError(fault.replace("dbc.input", "--dbc") for fault in error.faults) from None
-    except LogError as error:
-        raise WorkError(str(error)) from None
     found, facts = candidates(database), Facts()
     if log is not None:
-        try:
-            with progress("init") as step:
-                recording = recording_of(found, database, _counted(log.frames(), step))
-        except LogError as error:
-            raise WorkError(str(error)) from None
+        with progress("init") as step:
+            recording = recording_of(found, database, _counted(log.frames(), step))
         if log.note:
             say(log.note)
         if not recording.columns:
@@ -110,19 +105,13 @@ def run(args: argparse.Namespace) -> None:
     # python-can loads asammdf where it is installed: 2 s and 97 MB for files that the service never reads.
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
-        from soilbus.can.bus import BusError
-        from soilbus.config.model import ConfigError
         from soilbus.daemon.start import start_service
 
         config = configured(args)
         if config.table is not None or config.columns is not None:
             source = "[columns]: a table" if config.table is None else "[table]: a table of a test rig"
             raise ConfigError([f"{source} has no bus; replay and diagnose read it"])
-        wait = args.wait or "NOTIFY_SOCKET" in os.environ
-        try:
-            service = start_service(config, wait)
-        except BusError as error:
-            raise WorkError(str(error)) from None
+        service = start_service(config, args.wait or "NOTIFY_SOCKET" in os.environ)
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
             signal.signal(number, lambda *_: service.stop())
@@ -131,7 +120,6 @@ def run(args: argparse.Namespace) -> None:
 
 def check(args: argparse.Namespace) -> None:
     """Run `soilbus check`: the configuration, and with a recording or a live bus the data beside it."""
-    from soilbus.config.model import ConfigError
     from soilbus.report.configuration import (
         configuration_report,
         configuration_warnings,
@@ -163,24 +151,20 @@ def check(args: argparse.Namespace) -> None:
 
 def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, Log | SignalTable | None]:
     """What a recording, or the bus, says of the configuration, and the recording as far as it was read."""
-    from soilbus.can.bus import BusError, heard_for
+    from soilbus.can.bus import heard_for
     from soilbus.can.dbc_files import load_databases
-    from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError, log_of
+    from soilbus.offline.replay import log_of
     from soilbus.report.progress import progress
     from soilbus.sensors.survey import survey
 
     if config.table is not None:
         raise ConfigError(["[table]: check compares no table; replay and diagnose read it"])
     database = load_databases(config)
-    try:
-        if args.live is not None:
-            return survey(config, database, heard_for(config.bus.model_dump(), args.live)), None
-        log = log_of(config, args.log)
-        with progress("check") as step:
-            return survey(config, database, _counted(log.frames(), step)), log
-    except (LogError, BusError) as error:
-        raise WorkError(str(error)) from None
+    if args.live is not None:
+        return survey(config, database, heard_for(config.bus.model_dump(), args.live)), None
+    log = log_of(config, args.log)
+    with progress("check") as step:
+        return survey(config, database, _counted(log.frames(), step)), log
 
 
 def _machine_of(log: Path, config: Config) -> str:
@@ -210,9 +194,6 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 
 def watch(args: argparse.Namespace) -> None:
     """Run `soilbus watch`: the dashboard of the live bus or of a recording."""
-    from soilbus.can.bus import BusError
-    from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError
     from soilbus.report.watch import watch
 
     if args.channel is not None:
@@ -220,15 +201,12 @@ def watch(args: argparse.Namespace) -> None:
             raise ConfigError([f"--channel {args.channel}: {args.log} is a recording, which has no bus"])
         args.set.append(f"bus.channel={json.dumps(args.channel)}")
     config, is_named = configured_or_reference(args), args.config is not None
-    try:
-        watch(config, args.log, args.speed, is_named, args.seconds, args.plain, args.json)
-    except (BusError, LogError) as error:
-        raise WorkError(str(error)) from None
+    watch(config, args.log, args.speed, is_named, args.seconds, args.plain, args.json)
 
 
 def completion(args: argparse.Namespace) -> None:
     """Run `soilbus completion`: a shell's completion of commands, options and files."""
-    need_extra("shtab", "completion", "completion")
+    need_extra("completion", "completion", "shtab")
     import shtab
 
     from soilbus.cli.arguments import command_line, subcommands
@@ -242,12 +220,20 @@ def completion(args: argparse.Namespace) -> None:
 
 
 def docs(args: argparse.Namespace) -> None:
-    """Run `soilbus docs`: the pages that came with this version."""
-    from soilbus.cli.docs import overview, pages
-    from soilbus.config.model import ConfigError
+    """Run `soilbus docs`: the pages of this version, and the README of `dbc` and of `systemd`."""
     from soilbus.words import did_you_mean
 
-    found = pages()
-    if args.page is not None and args.page not in found:
+    package = Path(__file__).resolve().parents[1]
+    places = package, package.parent, package.parents[1]  # installed; or a checkout's folders
+    folders = {name: next(p / name for p in places if (p / name).is_dir()) for name in ("docs", "dbc", "systemd")}
+    found = {path.stem: path for path in sorted(folders["docs"].glob("*.md"))}
+    found |= {name: folders[name] / "README.md" for name in ("dbc", "systemd")}
+    if args.page in found:
+        print(found[args.page].read_text(encoding="utf-8"), end="")
+        return
+    if args.page is not None:
         raise ConfigError([f"no page {args.page}{did_you_mean(args.page, found)}"])
-    print(found[args.page].read_text(encoding="utf-8") if args.page else overview(), end="")
+    for name, path in found.items():
+        lines = path.read_text(encoding="utf-8").splitlines()
+        print(f"{name:16}{next(line.removeprefix('# ') for line in lines if line.startswith('# '))}")
+    print(f"\nsoilbus docs PAGE prints one; they lie in {folders['docs']}")

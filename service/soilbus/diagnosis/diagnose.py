@@ -30,11 +30,12 @@ from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect, Late
 from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
+from soilbus.words import WorkError
 
 __all__ = ["Diagnosis", "NotFitted", "diagnose"]
 
 
-class NotFitted(Exception):
+class NotFitted(WorkError):
     """The present model cannot be fitted to the recordings at all."""
 
 

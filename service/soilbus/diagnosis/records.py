@@ -25,11 +25,12 @@ from soilbus.estimation.variance_components import VarianceComponents
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
+from soilbus.words import WorkError
 
 __all__ = ["Record", "TooLittle", "record_of", "record_of_rows"]
 
 
-class TooLittle(ValueError):
+class TooLittle(WorkError, ValueError):
     """A recording holds too little to be divided; the text says what."""
 
 

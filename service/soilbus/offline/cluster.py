@@ -12,7 +12,7 @@ from typing import Any
 
 from soilbus import __version__
 from soilbus.offline.local_workers import local_workers
-from soilbus.words import one_line
+from soilbus.words import WorkError, one_line
 
 CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
@@ -20,7 +20,7 @@ TASKS_PER_THREAD = 3
 """Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
 
 
-class BatchError(Exception):
+class BatchError(WorkError):
     """Error of a batch that cannot be done to its end; the text is one line."""
 
 

@@ -22,7 +22,7 @@ def batch_text(batch: Batch, out: Path) -> str:
     text = table(head, [_row(row) for row in batch.vehicles[:MAX_ROWS]])
     if len(batch.vehicles) > MAX_ROWS:
         text += f"and {len(batch.vehicles) - MAX_ROWS} more vehicles in {shown(out / 'vehicles.parquet')}\n"
-    logs, failed = sum(row["logs.all"] for row in batch.vehicles), sum(row["logs.failed"] for row in batch.vehicles)
+    logs, failed = (sum(row[f"logs.{which}"] for row in batch.vehicles) for which in ("all", "failed"))
     text += f"{logs - failed} of {logs} logs done, {batch.windows} windows"
     text += f"; {batch.resumed - batch.failed_before} logs were done before" if batch.resumed else ""
     text += f"; {batch.failed_before} with a fault were not read again (--retry does)" if batch.failed_before else ""

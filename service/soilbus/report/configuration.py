@@ -18,19 +18,21 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.logs import Log
 from soilbus.can.mapping import AXLE_ROLES, SHARED_ROLES, WHEEL_ROLES, channels_of, without_unit
-from soilbus.config.model import Config, Form, Signal, Table
-from soilbus.estimation.assembly import effects_and_parameters_of, effects_of, rig_of
+from soilbus.config.model import Config, Form, Signal
+from soilbus.estimation.assembly import effects_and_parameters_of, effects_of, prior_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS
 from soilbus.estimation.window import VEHICLE_QUANTITIES, NoiseTable, made_window
 from soilbus.offline.columns import SignalTable
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.modelled_drive import modelled_drive
-from soilbus.pipeline.outputs import check_cycle_times
+from soilbus.pipeline.outputs import PARAMETER_FRAMES, check_cycle_times
 from soilbus.report.proposal import BEARING_STD_WITHOUT_CELLS
-from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
-from soilbus.sensors.survey import Seen, Survey
+from soilbus.sensors.survey import Survey
+from soilbus.terra.effects.sensors import lateness
+from soilbus.terra.soils import KINDS, SOILS
 from soilbus.words import shown, text_of
 
 
@@ -39,15 +41,21 @@ def configuration_report(config: Config) -> str:
     effects_and_parameters_of(config)
     if config.table is not None:
         columns = [(role, c.column, f"{c.factor:g}") for role, c in config.table.columns.items()]
-        return _report(config, [table(("role", "column", "factor to SI"), columns)])
-    database = load_databases(config)
-    channels = channels_of(config, database)
-    check_cycle_times(config, output_database(config))
-    assumed = {c.name for c in without_unit(channels, database)}
-    checked = checked_messages(config, database)
-    rows = [_row(channel, database, channel.name in assumed, channel.message in checked) for channel in channels]
-    head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
-    return _report(config, [table(head, rows)])
+        text = table(("role", "column", "factor to SI"), columns)
+    else:
+        database = load_databases(config)
+        channels = channels_of(config, database)
+        check_cycle_times(config, output_database(config))
+        assumed = {c.name for c in without_unit(channels, database)}
+        checked = checked_messages(config, database)
+        rows = [_row(c, database, c.name in assumed, c.message in checked) for c in channels]
+        text = table(("role", "signal", "unit", "factor to SI", "plausible", "every", "status"), rows)
+    text += "\nWhat these sensors determine of the soil:\n"
+    text += "".join(f"{name:<8} {verdict}\n" for name, verdict in identifiable(config).items())
+    text += "".join(f"\n{line}\n" for line in load_lines(config))
+    if effects := effect_lines(config):
+        text += "\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects)
+    return text + f"\nWhat is assumed of the soil before any data:\n{prior_text(config)}\n"
 
 
 def configuration_warnings(config: Config) -> list[str]:
@@ -56,31 +64,22 @@ def configuration_warnings(config: Config) -> list[str]:
     quantities = [q for q in _measured(config) if q not in config.noise.model_fields_set]
     if "noise" not in config.model_fields_set:
         lines.append(
-            "no [noise]: each sensor's noise is assumed to be that of a well-instrumented tractor, and the error bars"
-            " with it; give it from data sheets or a drive on the road"
+            "no [noise]: that of a well-instrumented tractor is assumed, and the error bars with it; give it from data"
+            " sheets or a drive on the road"
         )
     elif quantities:
         lines.append(f"[noise] does not give {', '.join(quantities)}: the defaults below are assumed")
-    if config.table is None and not rig_of(config).wheels:
-        lines.append(
-            "no wheel that drives has a torque and a speed mapped, its own or its axle's: nothing can be estimated"
-        )
-    elif config.table is None and config.signals.ground_speed is None:
-        lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
-    lines += _lines_of_vehicle(config)
+    if config.table is None:
+        lines += _lines_of_vehicle(config)
     for role in SHARED_ROLES:
         for wheels in config.same_signal(role):
             if len(wheels) > 1:
-                names = " and ".join(wheel.name for wheel in wheels)
+                names, alone = " and ".join(wheel.name for wheel in wheels), ""
+                if role == "load":
+                    alone = "; if it is the cell of one wheel, map it for that one alone: other loads are then computed"
                 lines.append(
                     f"{getattr(wheels[0], role).signal} is the {role} of {names}: one measurement of their mean, with"
-                    " one noise; what differs between them stays open"
-                    + (
-                        "; if it is the cell of one wheel, map it for that one alone: the loads of the others are then"
-                        " computed"
-                        if role == "load"
-                        else ""
-                    )
+                    f" one noise; what differs between them stays open{alone}"
                 )
     c = config.soil.c
     if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
@@ -101,35 +100,41 @@ def no_slope(config: Config) -> str:
 
 
 def _lines_of_vehicle(config: Config) -> Iterator[str]:
-    """A line for each key of the vehicle that contradicts what is mapped, or that nothing uses."""
-    if config.vehicle is None or config.table is not None:
+    """A line for each signal that is needed, and for each key that contradicts what is mapped or that nothing uses."""
+    vehicle, signals = config.vehicle, config.signals
+    if not rig_of(config).wheels:
+        yield "no wheel that drives has a torque and a speed mapped, its own or its axle's: nothing can be estimated"
+    elif signals.ground_speed is None:
+        yield "signals.ground_speed is not mapped: without slip nothing can be estimated"
+    if vehicle is None:
         return
-    if config.vehicle.towing == "measured" and config.signals.draft is None:
+    if vehicle.towing == "measured" and signals.draft is None:
         yield (
             'signals.draft is not mapped, and vehicle.towing is not "never": the draft is unknown, so there is no GO,'
             " only what could be pulled"
         )
-    if config.vehicle.towing == "unknown" and config.signals.draft is not None:
+    if vehicle.towing == "unknown" and signals.draft is not None:
         yield (
             'vehicle.towing = "unknown": signals.draft is not used, so there is no GO; if it shows all that is towed,'
             ' "measured" is meant'
         )
     if line := no_slope(config):
         yield line
-    if config.vehicle.steering == "skid" and not (config.vehicle.track or config.signals.yaw_rate):
+    if vehicle.steering == "skid" and not (vehicle.track or signals.yaw_rate):
         yield (
             'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: how far the wheels slide'
             " sideways in a turn is not known"
         )
     for wheel in config.wheel:
-        at_motor = (getattr(wheel, role) for role in WHEEL_ROLES)
-        if wheel.gear_ratio != 1.0 and not any(at_motor):
+        if wheel.gear_ratio != 1.0 and not any(getattr(wheel, role) for role in WHEEL_ROLES):
             yield (
                 f"{wheel.section}.{wheel.name}.gear_ratio = {wheel.gear_ratio:g} concerns no signal of it; that of the"
                 f" axle's motor is axle.{wheel.axle}.gear_ratio"
             )
 
 
+MAX_SOILS_NAMED = 3
+"""Soils outside an interval that are named; the others are counted."""
 SAMPLES_PER_SECOND = 50.0
 """Of each channel, where the DBC does not say otherwise: frames every 20 ms."""
 MIN_COHESION = 70.0
@@ -138,16 +143,15 @@ MIN_COHESION = 70.0
 
 def _measured(config: Config) -> Iterator[str]:
     """The quantities that are mapped and whose noise counts."""
-    names = {"wheel_load": "load", "drawbar_pull": "draft"}
     if config.table is not None:
+        names = {"wheel_load": "load", "drawbar_pull": "draft"}
         yield from (names.get(role, role) for role in config.table.columns if role != "t")
         return
     for quantity in type(config.noise).model_fields:
-        wheels = any(getattr(wheel, quantity, None) is not None for wheel in config.wheel)
-        axles = any(
-            getattr(a, role) is not None for a in config.axle for role in AXLE_ROLES if AXLE_ROLES[role] == quantity
-        )
-        if wheels or axles or getattr(config.signals, quantity, None) is not None:
+        of_axle = [role for role, measured in AXLE_ROLES.items() if measured == quantity]
+        places = [(config.signals, quantity), *((wheel, quantity) for wheel in config.wheel)]
+        places += [(axle, role) for axle in config.axle for role in of_axle]
+        if any(getattr(place, name, None) is not None for place, name in places):
             yield quantity
 
 
@@ -168,102 +172,71 @@ def log_report(log: Log | SignalTable, found: Survey) -> str:
 
 def survey_report(found: Survey) -> str:
     """Return the received values of every mapped signal, and what the recording cannot show."""
-    rows = [_heard_row(seen, found) for seen in found.seen]
+    rows = []
+    for seen in found.seen:
+        of_it = [f for f in found.findings if seen.channel.name in f.channels]
+        status = "plausible" if seen.count else "not heard"
+        if of_it:
+            status = "fault, see below" if any(f.fatal for f in of_it) else "warning, see below"
+        values = [f"{x:.4g}" if seen.count else "-" for x in (seen.low, seen.median, seen.high)]
+        every = f"{1e3 / seen.rate:.0f} ms" if math.isfinite(seen.rate) else "-"
+        refused = str(sum(seen.refused.values()))
+        rows.append((seen.channel.name, str(seen.count), every, *values, seen.unit, refused, status))
     head = ("role", "values", "every", "from", "median", "to", "unit", "refused", "beside the configuration")
     return "\n" + table(head, rows) + text_of(f"not checkable from this log: {line}" for line in found.open)
 
 
-def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
-    of_it = [f for f in found.findings if seen.channel.name in f.channels]
-    status = "fault, see below" if any(f.fatal for f in of_it) else "warning, see below" if of_it else "plausible"
-    if not seen.count:
-        status = status if of_it else "not heard"
-    return (
-        seen.channel.name,
-        str(seen.count),
-        f"{1e3 / seen.rate:.0f} ms" if math.isfinite(seen.rate) else "-",
-        f"{seen.low:.4g}" if seen.count else "-",
-        f"{seen.median:.4g}" if seen.count else "-",
-        f"{seen.high:.4g}" if seen.count else "-",
-        seen.unit,
-        str(sum(seen.refused.values())),
-        status,
-    )
-
-
-def _report(config: Config, parts: list[str]) -> str:
-    effects = effect_lines(config)
-    parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
-    parts += [f"\n{line}\n" for line in load_lines(config)]
-    if effects:
-        parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
-    parts.append("\nWhat is assumed of the soil before any data:\n" + prior_text(config) + "\n")
-    return "\n".join(parts[:1]) + "\nWhat these sensors determine of the soil:\n" + "".join(parts[1:])
-
-
 def defaults_text(config: Config) -> str:
     """Return every setting with its value in force, one dotted KEY = VALUE a line."""
-    lines: list[str] = []
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for k, v in value.items():
-                walk(f"{prefix}.{k}" if prefix else k, v)
-        elif prefix in ("axle", "wheel", "track"):
-            for part in value:
-                walk(f"{prefix}.{part['name']}", {k: v for k, v in part.items() if k not in _LISTED})
-        else:
-            lines.append(shown(f"{prefix} = {value}"))
-
     whole = config.model_dump(exclude={"signals", "folder"})
-    tracks = {track["name"] for track in whole["track"]}
-    whole["wheel"] = [wheel for wheel in whole["wheel"] if wheel["name"] not in tracks]
-    walk("", whole)
-    return "\n".join(lines)
+    listed = {"name", *WHEEL_ROLES, *AXLE_ROLES}  # or in the table of signals
+    for kind in ("track", "axle", "wheel"):  # the wheel of a track is the track
+        own = [part for part in whole[kind] if kind != "wheel" or part["name"] not in whole["track"]]
+        whole[kind] = {part["name"]: {k: v for k, v in part.items() if k not in listed} for part in own}
+
+    def lines(path: str, value: Any) -> Iterator[str]:
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                yield from lines(f"{path}.{key}" if path else key, inner)
+        else:
+            yield shown(f"{path} = {value}")
+
+    return "\n".join(lines("", whole))
 
 
-_LISTED = {"name", *WHEEL_ROLES, *AXLE_ROLES}
-"""Keys of a wheel, track or axle that say nothing beside the table of signals."""
-
-
-def load_lines(config: Config) -> list[str]:
-    """Return what replaces missing load cells, and what that costs in a window of varied draft."""
+def load_lines(config: Config) -> Iterator[str]:
+    """Yield what replaces missing load cells, and what that costs in a window of varied draft."""
     rig = rig_of(config)
     given = rig.instrumentation
     if given is None or rig.chassis is None or not given.computes("load").any():
-        return []
-    wheels = [wheel.model_copy(update={"load": wheel.load or Signal(signal="A.Cell")}) for wheel in config.wheel]
-    own, with_cells = _expected(config), _expected(config.model_copy(update={"wheel": wheels}))
+        return
     shared = [[rig.wheels[i] for i in np.flatnonzero(row.weight)] for row in given.load if row.kind == "channel"]
-    of_sums = {wheel for wheels in shared for wheel in wheels if len(wheels) > 1}
-    without = [rig.wheels[i] for i in np.flatnonzero(given.computes("load")) if rig.wheels[i] not in of_sums]
-    lines = [
-        f"{' and '.join(wheels)} are weighed together: what each carries follows from roll and their torques."
-        for wheels in shared
-        if len(wheels) > 1
-    ]
-    if without:
-        lines.append(
+    together = [wheels for wheels in shared if len(wheels) > 1]
+    for wheels in together:
+        yield f"{' and '.join(wheels)} are weighed together: what each carries follows from roll and their torques."
+    computed = [rig.wheels[i] for i in np.flatnonzero(given.computes("load"))]
+    if without := [wheel for wheel in computed if not any(wheel in wheels for wheels in together)]:
+        yield (
             f"No load cell at {', '.join(without)}: the load follows from mass, centre of gravity, pitch, acceleration"
             " and draft, and in a single instant is hardly known (noise.computed_load)."
         )
+    cells = [wheel.model_copy(update={"load": wheel.load or Signal(signal="A.Cell")}) for wheel in config.wheel]
+    own, with_cells = _expected(config), _expected(config.model_copy(update={"wheel": cells}))
     if own is None or with_cells is None:
-        return lines
+        return
     limit, load = config.estimator.max_bearing_std, "slope" if rig.towing == "never" else "draft"
-    way_out = "what is known of the soil, in [soil], narrows it"
-    if limit < own[0] <= BEARING_STD_WITHOUT_CELLS:
-        way_out = f"without load cells set it to {BEARING_STD_WITHOUT_CELLS:g}"
-    too_wide = [
-        f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std) count as not excited, and"
-        f" there is no GO; {way_out}."
-    ]
-    return [
-        *lines,
+    yield (
         f"After {config.estimator.window:g} s of varied {load} on the soil assumed below, bearing pressure is known to"
         f" {own[0]:.1%} (with load cells to {with_cells[0]:.1%}), tan phi to {own[1]:.1%} ({with_cells[1]:.1%}), as far"
-        " as the sensors go; what the form of the contact leaves open comes on top.",
-        *(too_wide if own[0] > limit else []),
-    ]
+        " as the sensors go; what the form of the contact leaves open comes on top."
+    )
+    if own[0] > limit:
+        is_usual = own[0] <= BEARING_STD_WITHOUT_CELLS
+        way_out = f"set it to {BEARING_STD_WITHOUT_CELLS:g}" if is_usual else "narrow the soil's prior in [soil]"
+        yield (
+            f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std) count as not excited, and"
+            f" there is no GO; without load cells {way_out}."
+        )
 
 
 def _expected(config: Config) -> tuple[float, float] | None:
@@ -301,8 +274,6 @@ def _expected(config: Config) -> tuple[float, float] | None:
 
 def effect_lines(config: Config) -> list[str]:
     """Return a line for each effect: which of its parameters are estimated and which held, or why it does not count."""
-    from soilbus.terra.effects.sensors import lateness  # not needed at a start without effects
-
     effects, free = effects_and_parameters_of(config)
     lines = []
     for active in effects_of(config):
@@ -310,22 +281,21 @@ def effect_lines(config: Config) -> list[str]:
         if effect.late:
             late = ", ".join(f"{quantity} {delay:.3g} s" for quantity, delay in lateness([active]).items())
             lines.append(f"{effect.name}: taken out of the samples' stamps: {late}")
-            continue
-        if effect not in effects:
+        elif effect not in effects:
             lines.append(f"{effect.name}: for simulate only; it describes the ground of one recording, no other's")
-            continue
-        own = [f for f in free if f.effect == effect.name]
-        estimated, held = (
-            list(dict.fromkeys(f.parameter.name for f in own if (f.std > 0.0) == e)) for e in (True, False)
-        )
-        parts = [f"{what} {', '.join(names)}" for what, names in (("estimated:", estimated), ("held:", held)) if names]
-        lines.append(f"{effect.name}: {'; '.join(parts)}")
+        else:
+            found: dict[str, dict[str, None]] = {}
+            for f in free:
+                if f.effect == effect.name:
+                    found.setdefault("estimated" if f.std > 0.0 else "held", {})[f.parameter.name] = None
+            parts = (f"{what}: {', '.join(names)}" for what, names in sorted(found.items()))
+            lines.append(f"{effect.name}: {'; '.join(parts)}")
     return lines
 
 
 def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool) -> tuple[str, ...]:
     message = database.get_message_by_name(channel.message)
-    signal = message.get_signal_by_name(channel.signal)
+    unit = message.get_signal_by_name(channel.signal).unit
     status = "SI assumed: no unit given" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
@@ -333,53 +303,61 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
         status += f", late by {channel.delay:g} s"
     if checked:
         status += ", counter and CRC required"
+    factor = f"{channel.factor:g}" + (f", + {channel.offset:g}" if channel.offset else "")
     every = f"{message.cycle_time} ms" if message.cycle_time else "not given"
-    return (
-        channel.name,
-        channel.path,
-        signal.unit or "-",
-        f"{channel.factor:g}" + (f", + {channel.offset:g}" if channel.offset else ""),
-        f"{channel.low:.4g} .. {channel.high:.4g}",
-        every,
-        status,
-    )
+    return channel.name, channel.path, unit or "-", factor, f"{channel.low:.4g} .. {channel.high:.4g}", every, status
 
 
-def identifiable(config: Config) -> list[tuple[str, str]]:
-    """Return each soil parameter with the sensors that determine it, or why none does."""
-    rig = rig_of(config)
-    held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
-    if config.table is not None:
-        verdicts = _verdicts_of_table(config.table)
-    elif not rig.wheels or config.signals.ground_speed is None:
+def identifiable(config: Config) -> dict[str, str]:
+    """Return what determines each soil parameter, or why nothing does."""
+    rig, columns = rig_of(config), config.table
+    if columns is not None:
+        forces = [role.replace("_", " ") for role in ("torque", "drawbar_pull") if role in columns.columns]
+        sinkage, widths = columns.sinkage is not None, False
+    else:
+        sinkage = any(wheel.sinkage for wheel in config.wheel if wheel.name in rig.wheels)
+        widths = len({float(width) for width in rig.width}) > 1
+        has_slip = bool(rig.wheels) and config.signals.ground_speed is not None
+        forces = (["torque", "draft"] if config.measures_draft else ["torque"]) if has_slip else []
+    if not forces and not sinkage:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
-        draft = config.measures_draft
-        widths = len({float(b) for b in rig.width}) > 1
-        sinkage = any(w.sinkage for w in config.wheel if w.name in rig.wheels)
-        both = "yes: torque and draft over varied load and slip"
-        alone = "weakly: torque alone; a draft signal would help"
+        is_sure = len(forces) == 2
+        strength = (
+            f"{'yes' if is_sure else 'weakly'}: {', '.join(forces)}" if forces else "no: needs torque or drawbar pull"
+        )
+        depth = f"{'yes' if is_sure or sinkage else 'weakly'}: {', '.join([*forces, *['sinkage'] * sinkage])}"
         verdicts = {
             "k_c": "weakly: two tyre widths" if widths else "no: needs two tyre widths (prior kept)",
-            "k_phi": (both if draft else alone) + (", and sinkage" if sinkage else ""),
-            "n": (both if draft else alone) + (", and sinkage" if sinkage else ""),
-            "phi": both if draft else alone,
-            "c": "partly: torque over varied load; the prior counts",
-            "K": "yes: torque over varied slip",
+            "k_phi": f"{depth} over varied load",
+            "n": f"{depth} over varied load",
+            "phi": f"{strength} over varied load and slip",
+            "c": f"{strength.replace('yes', 'partly')} over varied load; the prior counts",
+            "K": f"{strength.replace('weakly', 'yes')} over varied slip",
         }
-    return [(name, "held by the configuration" if name in held else text) for name, text in verdicts.items()]
+    held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
+    return {name: "held by the configuration" if name in held else text for name, text in verdicts.items()}
 
 
-def _verdicts_of_table(columns: Table) -> dict[str, str]:
-    """What the columns of a test rig determine of each soil parameter."""
-    forces = " and ".join(role.replace("_", " ") for role in ("torque", "drawbar_pull") if role in columns.columns)
-    depth = "yes: sinkage over varied load" if columns.sinkage else f"weakly: {forces} alone; sinkage would help"
-    strength = f"{forces} over varied" if forces else "no: needs torque or drawbar pull (prior kept)"
-    return {
-        "k_c": "no: needs two tyre widths (prior kept)",
-        "k_phi": depth,
-        "n": depth,
-        "phi": f"yes: {strength} load and slip" if forces else strength,
-        "c": f"partly: {strength} load; the prior counts" if forces else strength,
-        "K": f"yes: {strength} slip" if forces else strength,
-    }
+def prior_text(config: Config) -> str:
+    """Return the 95 % interval of each parameter before any data, and the known soils that lie outside of it.
+
+    On a soil outside, a badly determined parameter would stay near the prior, with too small an sd.
+    """
+    prior, rows = prior_of(config), list[tuple[str, ...]]()
+    for name, median, log_std in zip(PARAMETERS, prior.median.tolist(), prior.log_std.tolist(), strict=True):
+        _, unit, size = PARAMETER_FRAMES[name]
+        if log_std == 0.0:
+            rows.append((name, f"{median / size:.3g}", "held", "", unit, ""))
+            continue
+        low, high = (median * math.exp(way * NORMAL_95 * log_std) for way in (-1.0, 1.0))
+        values = {kind: getattr(SOILS[kind], name) for kind in KINDS}
+        outside = sorted((kind for kind, v in values.items() if not low <= v <= high), key=lambda kind: -values[kind])
+        named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MAX_SOILS_NAMED])
+        more = f" and {len(outside) - MAX_SOILS_NAMED} more" if len(outside) > MAX_SOILS_NAMED else ""
+        rows.append((name, *(f"{x / size:.3g}" for x in (median, low, high)), unit, named + more or "none"))
+    return (
+        table(("parameter", "assumed", "95 % from", "to", "unit", "known soils outside"), rows)
+        + "\nOn a soil outside, a badly determined parameter stays near the prior, with a deviation too small; set"
+        "\n[soil] there.  Bearing pressure, drafts and slopes depend on what the sensors determine well."
+    )

@@ -1,7 +1,6 @@
 """The dashboard's knowledge: what our frames say now and said in the last minute, in words.
 
-It reads only our frames, as any dashboard ECU would, and judges them by the rules of dbc/README.md. The pages
-(`driver_page`, `engineer_page`) draw it; `sentences` say it to whoever hears or logs it.
+It judges them by the rules of dbc/README.md; the pages (`driver_page`, `engineer_page`) draw it, `sentences` say it.
 """
 
 from __future__ import annotations
@@ -23,6 +22,13 @@ LONGEST_HOLD = 0.5
 """Time [s] for which a sample stands where none follows: more than twice the time between two pictures."""
 TOP_TIME_LEFT = 25.0
 """Top of the range [s] of DemandForecast.TimeLeft: this long or longer."""
+HISTORIES = {
+    "draft": ("PresentDemand", "Draft"),
+    "bearing": ("SoilStrength", "BearingPressure"),
+    "chi2": ("SoilStrength", "Chi2"),
+    "rejected": ("WindowQuality", "Rejected"),
+}
+"""Signals that charts show as they are."""
 WHEELS = 8
 """Wheels of which our frames can speak."""
 
@@ -35,8 +41,6 @@ ADVICE = {
     ("caution", "sinkage"): "Less load, firmer ground",
     ("caution", None): "Go slowly, watch the slip",
     ("no_go", "torque"): "Stop, reduce the draft",
-    ("no_go", "traction"): "Stop, lift the implement",
-    ("no_go", "slip"): "Stop, lift the implement",
     ("no_go", "sinkage"): "Stop, turn off soft ground",
     ("no_go", None): "Stop, lift the implement",
     ("go", "stuck"): "Lift, add no torque",
@@ -48,7 +52,6 @@ ADVICE = {
 UNLADEN = "Go slowly, add no torque", "Stop, add no torque"
 """The same without and with a stop, where nothing is pulled and the advice would name draft or implement."""
 HELD = {"caution": "Go slowly, caution is held", "no_go": "Stop, no-go is held"}
-ABOVE_BEST = {"go": "Keep going, slip above best", "caution": "Go slowly, slip above best"}
 GONE_ADVICE = "Rely on your own judgement"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
@@ -161,15 +164,8 @@ class Dashboard:
         now, known = self.known.now, self.known
         if self._samples and 0.0 <= now - self._samples[-1][0] < SAMPLE_PERIOD:
             return
-        values = {
-            "draft": known.number("PresentDemand", "Draft"),
-            "max_draft": self.max_draft(),
-            "slip": self.slip().value,
-            "best_slip": self.slip().best,
-            "bearing": known.number("SoilStrength", "BearingPressure"),
-            "chi2": known.number("SoilStrength", "Chi2"),
-            "rejected": known.number("WindowQuality", "Rejected"),
-        }
+        values = {name: known.number(*signal) for name, signal in HISTORIES.items()}
+        values |= {"max_draft": self.max_draft(), "slip": self.slip().value}
         self._samples.append((now, {name: value for name, value in values.items() if value is not None}))
         while self._samples[0][0] < now - self.span or self._samples[0][0] > now:
             self._samples.popleft()
@@ -210,16 +206,11 @@ class Dashboard:
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
-        limit, probability = (
-            known.value("Traversability", "LimitingCause"),
-            known.number("Traversability", "Probability"),
-        )
+        limit = known.value("Traversability", "LimitingCause")
+        probability = known.number("Traversability", "Probability")
         todo = self._advice(state, str(limit))
-        if state == "go" or (probability or 0.0) >= self.vehicle.go:
+        if (probability or 0.0) >= self.vehicle.go:
             todo = HELD.get(state, todo)  # nothing limits it: more windows must say the same
-            slip, best = self.slip().value, self.slip().best
-            if slip is not None and best is not None and round(100.0 * slip) > round(100.0 * best):
-                todo = ABOVE_BEST.get(state, todo)  # in whole per cents, as a driver reads them
         because = [] if limit in (None, "none") else [f"limit: {limit}"]
         because += [] if probability is None else [f"p = {probability:.2f}"]
         return Verdict(NAMES[state], ", ".join((NAMES[state], *because)), todo, state)
@@ -228,9 +219,8 @@ class Dashboard:
         """Return what to do by state and limiting cause, or `stuck`."""
         said = ADVICE.get((state, cause)) or ADVICE[state, None]
         draft = self.known.number("PresentDemand", "Draft")
-        if draft is None or draft > 0.0 or not re.search("draft|lift", said, re.IGNORECASE):
-            return said
-        return UNLADEN[said.startswith("Stop")]
+        pulls = draft is None or draft > 0.0 or not re.search("draft|lift", said, re.IGNORECASE)
+        return said if pulls else UNLADEN[said.startswith("Stop")]
 
     def _unknown(self) -> tuple[str, str]:
         """Why the state is unknown, and what to do."""
@@ -249,13 +239,9 @@ class Dashboard:
         has_no_window = known.number("SoilbusStatus", "Window") is None
         if has_no_window and reason in ("none", "None", "not_excited", "model_gap"):
             return f"the first window takes {self.vehicle.window:g} s", MEASURING
-        if (
-            reason not in REASONS
-            and not known.is_stale("PresentDemand")
-            and known.number("PresentDemand", "Draft") is None
-        ):
-            was_there = any("draft" in values for _, values in self._samples)
-            return "the draft is not heard any more" if was_there else "no sensor shows the draft", "Go carefully"
+        has_draft = known.is_stale("PresentDemand") or known.number("PresentDemand", "Draft") is not None
+        if reason not in REASONS and not has_draft:
+            return "no sensor shows the draft", "Go carefully"
         slip = self.slip().value
         if reason == "standstill" and slip is not None and slip >= CARRYING_SLIP:
             # they make no way, so the service calls it a standstill
@@ -306,13 +292,12 @@ class Dashboard:
         most = self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
         return None if most is None else max(most, 0.0)
 
-    def draft_of(self, draft: float, before: str = "of ", unknown: str = "") -> str:
-        """Return the draft [N] and the largest one in one unit; a negative draft brakes."""
-        most = self.max_draft()
-        unit = max(abs(draft), abs(most or 0.0))
-        now = force(draft, unit)
-        now = f"braking {now[1:]}" if now.startswith("-") else now
-        return now + (f" {before}{force(most, unit)}" if most is not None else f" {before}{unknown}" * bool(unknown))
+    def drafts(self) -> tuple[str, str]:
+        """Return the draft and the largest one in one unit, "-" where not known; a negative draft brakes."""
+        now, most = self.known.number("PresentDemand", "Draft"), self.max_draft()
+        unit = max(abs(now or 0.0), abs(most or 0.0))
+        said, possible = ("-" if x is None else force(x, unit) for x in (now, most))
+        return f"braking {said[1:]}" if said.startswith("-") and now is not None else said, possible
 
     def freshness(self) -> str:
         """Return the age of the data behind the verdict, or that the recording has ended."""
@@ -326,13 +311,13 @@ class Dashboard:
 
     def sentences(self) -> list[str]:
         """Return the state, what to do, slip, draft, age, and why the bus is away; each where it is known."""
-        verdict, slip, draft = self.verdict(), self.slip(), self.known.number("PresentDemand", "Draft")
+        verdict, slip, (draft, most) = self.verdict(), self.slip(), self.drafts()
         parts = [verdict.said, verdict.todo]
         if slip.value is not None:
             best = "" if slip.best is None else f", best {percent(slip.best)}"
             parts.append(f"Slip {percent(slip.value)} at wheel {slip.wheel}{best}")
-        if draft is not None:
-            parts.append(f"Draft {self.draft_of(draft)}")
+        if draft != "-":
+            parts.append(f"Draft {draft}" + ("" if most == "-" else f" of {most}"))
         parts += [] if verdict.kind == "gone" else [self.freshness().capitalize()]
         parts += [f"Bus away: {self.fault}"] if self.fault else []
         return parts
@@ -343,7 +328,7 @@ def percent(share: float) -> str:
     return f"{round(100.0 * share)} %"
 
 
-def force(newtons: float, largest: float | None = None) -> str:
+def force(newtons: float, largest: float) -> str:
     """Return a force in kN, or in N where the largest one of its line is below 1 kN."""
-    size, digits, unit = (1.0, 0, "N") if abs(newtons if largest is None else largest) < 1000.0 else (1000.0, 1, "kN")
+    size, digits, unit = (1.0, 0, "N") if abs(largest) < 1000.0 else (1000.0, 1, "kN")
     return f"{round(newtons / size, digits) + 0.0:.{digits}f} {unit}"

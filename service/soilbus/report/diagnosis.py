@@ -8,10 +8,9 @@ from pathlib import Path
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.offline.diagnose import Findings
 from soilbus.report.diagnosis_pictures import agreement_pictures, agreements, draft_picture, gap_picture
-from soilbus.report.findings import findings_text
-from soilbus.report.next_drive import hope_of
-from soilbus.report.page import Picture, Source, Step, page
-from soilbus.report.statement import doubt, headline, is_open, plain_gap, statement, to_tell_apart
+from soilbus.report.findings import findings_text, hope_of
+from soilbus.report.page import Source, Step, page
+from soilbus.report.statement import doubt, headline, plain_gap, statement, to_tell_apart
 
 
 def diagnosis_report(findings: Findings, source: Source, model_out: Path | None = None) -> str:
@@ -23,7 +22,10 @@ def diagnosis_report(findings: Findings, source: Source, model_out: Path | None 
     added = diagnosis.completed is not diagnosis.base
     channels = agreements(diagnosis.base, diagnosis.completed)
     pictures = [pair for channel in channels for pair in agreement_pictures(channel, added)]
-    sums = list(_sums(findings))
+    gaps = gap_picture(diagnosis.base, diagnosis.completed)
+    sums = [("How far each channel is from the model: 1 is as near as the sensors’ noise allows.", gaps)]
+    if (drafts := draft_picture(findings)) is not None:
+        sums.append(("Largest steady draft on the level, by the soil of each recording.", drafts))
     lead = f"{diagnosis.verdict}: {statement(diagnosis)}. {plain_gap(diagnosis)} {_consequence(findings)}"
     by_channel = (
         "Each reading beside what the model makes of the other sensors’ readings. Only readings that the model was not"
@@ -47,16 +49,6 @@ def diagnosis_report(findings: Findings, source: Source, model_out: Path | None 
     )
 
 
-def _sums(findings: Findings) -> Iterator[tuple[str, Picture]]:
-    """Caption and picture of the gaps, and of the largest draft."""
-    diagnosis = findings.diagnosis
-    gaps = gap_picture(diagnosis.base, diagnosis.completed)
-    yield "How far each channel is from the model: 1 is as near as the sensors’ noise allows.", gaps
-    drafts = draft_picture(findings)
-    if drafts is not None:
-        yield "Largest steady draft on the level, by the soil of each recording.", drafts
-
-
 def _consequence(findings: Findings) -> str:
     """What the effects change of the soil and the largest draft of the first recording."""
     if findings.diagnosis.completed is findings.diagnosis.base:
@@ -77,18 +69,19 @@ def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterat
     """What to do next."""
     diagnosis = findings.diagnosis
     if diagnosis.additions and model_out is None:
-        yield Step(
-            "Write a configuration that has what was found:", f"{source.command('diagnose')} --model-out new.toml"
-        )
+        command = f"{source.command('diagnose')} --model-out new.toml"
+        yield Step("Write a configuration that has what was found:", command)
     if diagnosis.additions:
         command = f"{source.command('replay', model_out or 'new.toml')} --report replay.html"
         yield Step("See what the service makes of the recording with it:", command)
     if diagnosis.verdict is Verdict.UNKNOWN:
         yield Step("Check mass, radii, gear ratios, signs and mounting of the channels that disagree most.")
-    if diagnosis.verdict is Verdict.NONE and is_open(diagnosis):
-        yield Step("Compare the noise that the configuration states with that of the sensors; measure wheel loads.")
-    elif diagnosis.verdict is Verdict.NONE:
-        yield Step("Nothing is to be added. Smaller effects show in longer recordings that vary the load more.")
+    if diagnosis.verdict is Verdict.NONE:
+        yield Step(
+            "Compare the noise that the configuration states with that of the sensors; measure wheel loads."
+            if diagnosis.gap_after.exceeds_noise()
+            else "Nothing is to be added. Smaller effects show in longer recordings that vary the load more."
+        )
     for sentence, lines in to_tell_apart(diagnosis):
         yield Step(sentence, lines=lines)
     if findings.plan is not None:

@@ -5,7 +5,6 @@ All readings are of held-out blocks, which the model was not fitted to.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -43,14 +42,12 @@ class Quantity(NamedTuple):
 
 QUANTITIES = {
     "torque": Quantity("torque", "N m", 1.0), "draft": Quantity("draft", "N", 1.0),
-    "sinkage": Quantity("sinkage", "mm", 1e-3),
+    "sinkage": Quantity("sinkage", "mm", 1e-3), "slip": Quantity("slip", "%", 0.01),
+    "load": Quantity("load of a wheel", "kN", 1e3), "speed": Quantity("ground speed", "m/s", 1.0),
+    "since": Quantity("time", "s", 1.0),
 }  # fmt: skip
-"""The channels."""
-REGRESSORS = {
-    "slip": Quantity("slip", "%", 0.01), "load": Quantity("load of a wheel", "kN", 1e3),
-    "speed": Quantity("ground speed", "m/s", 1.0), "since": Quantity("time", "s", 1.0),
-}  # fmt: skip
-"""What differences are plotted over."""
+"""The channels, and what differences are plotted over."""
+REGRESSORS = ("slip", "load", "speed", "since")
 
 
 class Agreement(NamedTuple):
@@ -58,7 +55,6 @@ class Agreement(NamedTuple):
 
     channel: str
     regressor: str
-    gain: float
     before: tuple[Series, ...]
     after: tuple[Series, ...]
 
@@ -79,8 +75,8 @@ def agreements(base: FittedModel, completed: FittedModel) -> list[Agreement]:
             for name in REGRESSORS
         }
         name = max(gains, key=lambda name: gains[name])
-        found.append(Agreement(channel, name, gains[name], tuple(before), tuple(after)))
-    return sorted(found, key=lambda agreement: -agreement.gain)
+        found.append((gains[name], Agreement(channel, name, tuple(before), tuple(after))))
+    return [agreement for _, agreement in sorted(found, key=lambda pair: -pair[0])]
 
 
 def _trend(series: Series, reference: Series, regressor: str) -> float:
@@ -104,10 +100,8 @@ def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Pictur
         difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
         typical = float(np.sqrt(np.mean(difference**2)))
         caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
-        yield (
-            caption[0].upper() + caption[1:],
-            picture(partial(_draw_agreement, of=of, series=series), 4.6, f"{when}{name}"),
-        )
+        drawn = picture(partial(_draw_agreement, of=of, series=series), 4.6, f"{when}{name}")
+        yield caption[0].upper() + caption[1:], drawn
 
 
 def _ends(values: Array) -> tuple[float, float]:
@@ -120,7 +114,7 @@ def _ends(values: Array) -> tuple[float, float]:
 def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series]) -> None:
     """Above: measured over modelled. Below: the difference over the regressor, with means over bins."""
     whole, part = figure.subplots(2, 1, height_ratios=[1.1, 1.0])
-    unit, regressor = QUANTITIES[of.channel], REGRESSORS[of.regressor]
+    unit, regressor = QUANTITIES[of.channel], QUANTITIES[of.regressor]
     both = of.before + of.after  # whose scales are the same
     readings = _ends(np.concatenate([values for s in both for values in (s.measured, s.modelled)]) / unit.si)
     along = _ends(np.concatenate([getattr(s, of.regressor) for s in both]) / regressor.si)
@@ -163,46 +157,39 @@ def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
         for when, of in bars.items()
     )
     height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
-    return picture(lambda figure: _draw_gaps(figure, bars), height, f"error of the model over noise: {words}")
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
+        sizes = {when: list(of.values()) for when, of in bars.items()}
+        labels = {when: [f"{size:.2f}" for size in of] for when, of in sizes.items()}
+        drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
+        axis.set_yticks(range(len(bars["before"])), list(bars["before"]))
+        axis.set_xlabel("model’s error, × noise of the sensors")
+        figure.legend(handles=[*drawn, noise], loc="outside lower center", ncols=3, frameon=False)
+
+    return picture(draw, height, f"error of the model over noise: {words}")
 
 
 def _bars(
-    axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Sequence[str],
+    axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Mapping[str, Sequence[str]],
     sd: Mapping[str, Sequence[float]] | None = None,
 ) -> list[Any]:  # fmt: skip
-    """Draw groups of horizontal bars, before above after, each with a label at its end; returns one for each look."""
-    words = iter(labels)
+    """Draw groups of horizontal bars, before above after, labelled at their ends; returns one for each of two looks."""
     drawn = []
     for i, (when, sizes) in enumerate(bars.items()):
         colour, hatch = LOOKS[when] if len(bars) > 1 else LOOKS["after"]
         y = np.arange(len(sizes)) + (i - (len(bars) - 1) / 2.0) * height
         error = {} if sd is None else {"xerr": 2.0 * np.array(sd[when]), "capsize": 3}
-        drawn.append(
-            axis.barh(y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error)
+        bar = axis.barh(
+            y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error
         )
-        spread = [0.0] * len(sizes) if sd is None else sd[when]
-        for place, size, std in zip(y, sizes, spread, strict=True):
-            axis.annotate(
-                next(words), (np.nan_to_num(size + 2.0 * std), place), (5, 0), textcoords="offset points", va="center",
-                fontsize=10, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
-            )  # fmt: skip
+        axis.bar_label(bar, labels[when], padding=5, fontsize=10)
+        drawn += [bar] if len(bars) > 1 else []
     axis.invert_yaxis()
     axis.set_xlim(min(0.0, axis.get_xlim()[0]), 1.16 * axis.get_xlim()[1])
     axis.grid(axis="y", visible=False)
     return drawn
-
-
-def _draw_gaps(figure: Any, bars: Mapping[str, Mapping[str, float]]) -> None:
-    axis = figure.subplots()
-    channels = list(bars["before"])
-    noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
-    sizes = {when: list(of.values()) for when, of in bars.items()}
-    labels = [f"{size:.2f}" for of in sizes.values() for size in of]
-    drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
-    axis.set_yticks(range(len(channels)), channels)
-    axis.set_xlabel("model’s error, × noise of the sensors")
-    handles = [*(drawn if len(bars) > 1 else []), noise]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
 def draft_picture(findings: Findings) -> Picture | None:
@@ -221,30 +208,28 @@ def draft_picture(findings: Findings) -> Picture | None:
         " ".join([name, *(f"{when} {_kilonewtons(of[i])}" for when, of in bars.items())])
         for i, name in enumerate(names)
     )
-    return picture(
-        lambda figure: _draw_drafts(figure, names, bars, pulled), 1.6 + 0.75 * len(drafts), f"largest draft: {words}"
-    )
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        none = Estimate(0.0, 0.0)
+        sizes, sds = (
+            {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()}
+            for part in ("value", "std")
+        )
+        labels = {when: [_kilonewtons(e) for e in of] for when, of in bars.items()}
+        handles = _bars(axis, sizes, 0.55 / len(bars), labels, sds)
+        known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
+        lines = [
+            axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")[0]
+            for i, low, high in known
+        ]
+        axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
+        axis.set_xlabel("draft, kN")
+        if handles := [*handles, *lines[:1]]:
+            figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+
+    return picture(draw, 1.6 + 0.75 * len(drafts), f"largest draft: {words}")
 
 
 def _kilonewtons(draft: Estimate | None) -> str:
     return "none within the limits" if draft is None else f"{draft.value / 1e3:.2f} kN"
-
-
-def _draw_drafts(
-    figure: Any, names: Sequence[str], bars: Mapping[str, Sequence[Estimate | None]], pulled: Sequence[Array]
-) -> None:
-    axis = figure.subplots()
-    none = Estimate(math.nan, math.nan)
-    sizes, sds = (
-        {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()} for part in ("value", "std")
-    )
-    drawn = _bars(axis, sizes, 0.55 / len(bars), [_kilonewtons(e) for of in bars.values() for e in of], sds)
-    handles = drawn if len(bars) > 1 else []
-    known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
-    for i, low, high in known:
-        line = axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")
-        handles = [*(drawn if len(bars) > 1 else []), *line]
-    axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
-    axis.set_xlabel("draft, kN")
-    if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)

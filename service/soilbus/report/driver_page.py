@@ -80,20 +80,15 @@ def _slip(dashboard: Dashboard, width: int, height: int) -> list[Text]:
 
 def _draft(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     """Title, chart of the last minute and axis, in `height` rows."""
-    now, possible = dashboard.known.number("PresentDemand", "Draft"), dashboard.max_draft()
-    if now is not None:
-        said = dashboard.draft_of(now, " of possible ", "-")
-    else:
-        said = f"-  of possible {'-' if possible is None else force(possible)}"
     columns, rows = width - AXIS, height - 2
     draft, limit = (dashboard.history(name, columns) for name in ("draft", "max_draft"))
     top = 1.05 * max([abs(value) for value in (*draft, *limit) if value is not None], default=0.0)
     chart = area(draft, rows, top or 1.0, limit)
-    scale = [f"{force(top) if top else '':>{AXIS - 2}} ┤", *[f"{'│':>{AXIS}}"] * (rows - 2), f"{'0 ┤':>{AXIS}}"]
+    scale = [f"{force(top, top) if top else '':>{AXIS - 2}} ┤", *[f"{'│':>{AXIS}}"] * (rows - 2), f"{'0 ┤':>{AXIS}}"]
     axis = f"{'':{AXIS}}{f'{dashboard.span:.0f} s ago':<{columns - 3}}now"
     legend = "█ draft  ─ possible"
     return [
-        Text(f"{f'DRAFT  {said}':<{width - len(legend)}}{legend}", style="bold"),
+        Text(f"{'DRAFT  ' + '  of possible '.join(dashboard.drafts()):<{width - len(legend)}}{legend}", style="bold"),
         *(Text(left + right) for left, right in zip(scale, chart, strict=True)),
         Text(axis),
     ]

@@ -1,13 +1,12 @@
 """The engineer's page: every value of our frames, with history, chi-square of each channel and refused inputs.
 
-Grey figures have a Status other than valid: they are guesses that must not be acted on. "-" is a value that is not
-available or too old. Blocks are packed into as many columns as the width has room for; charts take the rows left.
+Grey figures have a Status other than valid: guesses that must not be acted on; "-" is not available or too old.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from rich.text import Text
 
@@ -45,11 +44,11 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     """Return the engineer's page: at most `height` lines of at most `width` columns."""
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         return small_page(dashboard, width, height)
-    verdict, soil = dashboard.verdict(), "  ".join(_kind(dashboard.known))
+    verdict, known = dashboard.verdict(), dashboard.known
+    soil = _said(known, "SoilClass", "Kind", "soil: {}") + _said(known, "SoilClass", "Probability", "  ({:.2f})")
     state = f" {verdict.said}"
     state = f"{state:<{max(width - len(soil) - 1, len(state) + 2)}}{soil} "[:width].ljust(width)
-    forecast = Text("  ".join(_forecast(dashboard.known)))
-    head = [Text(state, style=verdict.style), fitted(forecast, width)]
+    head = [Text(state, style=verdict.style), fitted(Text(_forecast(known)), width)]
     blocks = [block(dashboard) for block in BLOCKS]
     columns = max(width // (COLUMN + GAP), 1)
     room = height - len(head) - 1
@@ -88,10 +87,11 @@ def packed(blocks: list[list[Text]], columns: int, width: int, space: int) -> li
     return lines
 
 
-def grid(title: Row, *rows: Row) -> list[Text]:
-    """Return the rows in columns as wide as their widest cell, with a bold title."""
-    cells = [[Text(cell, style="bold") if isinstance(cell, str) else cell for cell in title]]
-    cells += [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
+def grid(*rows: Row) -> list[Text]:
+    """Return the rows in columns as wide as their widest cell; the first, of texts, is a bold title."""
+    title, *others = rows
+    cells = [[Text(str(cell), style="bold") for cell in title]]
+    cells += [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in others]
     widths = [max(cell.cell_len for cell in column) for column in zip(*cells, strict=True)]
     lines = []
     for row in cells:
@@ -104,20 +104,17 @@ def grid(title: Row, *rows: Row) -> list[Text]:
     return lines
 
 
-def _kind(known: ReceivedFrames) -> Iterator[str]:
-    yield from _said(known, "SoilClass", "Kind", "soil: {}")
-    yield from _said(known, "SoilClass", "Probability", "({:.2f})")
-
-
-def _forecast(known: ReceivedFrames) -> Iterator[str]:
+def _forecast(known: ReceivedFrames) -> str:
     """Torque that the present demand needs, and the slip and sinkage predicted for it."""
     needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
-    if needed is not None or there is not None:
-        yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
     slip = known.number("DemandForecast", "Slip")
+    said = []
+    if needed is not None or there is not None:
+        said.append("torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there))))
     if slip is not None:
-        yield f"slip to come {percent(slip)}"
-    yield from _said(known, "DemandForecast", "Sinkage", "sinkage to come {:.0f} mm")
+        said.append(f"slip to come {percent(slip)}")
+    said.append(_said(known, "DemandForecast", "Sinkage", "sinkage to come {:.0f} mm"))
+    return "  ".join(said)
 
 
 def _soil(dashboard: Dashboard) -> list[Text]:
@@ -129,12 +126,10 @@ def _soil(dashboard: Dashboard) -> list[Text]:
 
 
 def _wheels(dashboard: Dashboard) -> list[Text]:
-    """One row for each wheel."""
     rows: list[Row] = []
     for i in dashboard.wheels():
         slip, depth = dashboard.wheel_slip(i), dashboard.wheel_sinkage(i)
-        grey = "" if dashboard.known.is_valid("WheelSinkage" if i < 4 else "WheelSinkage2") else "dim"
-        shown = Text("-" if depth is None else f"{depth:.0f}", style=grey)
+        shown = _cell(dashboard.known, "WheelSinkage" if i < 4 else "WheelSinkage2", depth, "{:.0f}")
         rows.append((dashboard.vehicle.name(i), "-" if slip is None else f"{100.0 * slip:+.1f}", shown))
     return grid(("wheel", "slip, %", "sinkage, mm"), *rows)
 
@@ -142,26 +137,27 @@ def _wheels(dashboard: Dashboard) -> list[Text]:
 def _limits(dashboard: Dashboard) -> list[Text]:
     """Largest draft and slope beside the present ones; a slope in per cent is 100 times its tangent."""
     known = dashboard.known
-    rows: list[Row] = [
-        (name, _pair(known, draft, "MaxDraft"), _slope(known, slope)) for name, (draft, slope) in LIMITS.items()
-    ]
+
+    def slope_of(message: str) -> Text:
+        angle, spread = known.number(message, "MaxGrade"), known.number(message, "MaxGradeStd")
+        if angle is None or spread is None or abs(angle) >= math.pi / 2.0:
+            return _cell(known, message, None)
+        slope = math.tan(angle)
+        return _cell(known, message, _figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)))
+
+    rows: list[Row] = [(name, _pair(known, of, "MaxDraft"), slope_of(grade)) for name, (of, grade) in LIMITS.items()]
     draft, pitch = (known.number("PresentDemand", name) for name in ("Draft", "Slope"))
     now = ("now", "-" if draft is None else f"{draft:.0f}", "-" if pitch is None else f"{100.0 * math.tan(pitch):.1f}")
     return grid(("largest", "draft, N", "slope, %"), *rows, now)
 
 
-def _slope(known: ReceivedFrames, message: str) -> Text:
-    angle, spread = known.number(message, "MaxGrade"), known.number(message, "MaxGradeStd")
-    if angle is None or spread is None or abs(angle) >= math.pi / 2.0:
-        return _cell(known, message, None)
-    slope = math.tan(angle)
-    return _cell(known, message, _figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)))
-
-
 def _advice(dashboard: Dashboard) -> list[Text]:
-    known = dashboard.known
+    def cell(signal: str) -> Text:
+        share = dashboard.known.number("TractionAdvice", signal)
+        return _cell(dashboard.known, "TractionAdvice", None if share is None else 100.0 * share, "{:.0f}")
+
     rows: list[Row] = [
-        (name, *(_one(known, "TractionAdvice", f"SlipFor{kind}{axle}", "{:.0f}", 0.01) for axle in ("Front", "Rear")))
+        (name, cell(f"SlipFor{kind}Front"), cell(f"SlipFor{kind}Rear"))
         for name, kind in (("efficiency", "Efficiency"), ("most pull", "Pull"))
     ]
     return grid(("best slip, %, for", "front", "rear"), *rows)
@@ -169,42 +165,39 @@ def _advice(dashboard: Dashboard) -> list[Text]:
 
 def _gap(dashboard: Dashboard) -> list[Text]:
     known = dashboard.known
-    rows: list[Row] = [("window", _one(known, "SoilStrength", "Chi2", "{:.1f}"))]
-    rows += [(c.lower(), _one(known, "WindowQuality", f"Chi2{c}", "{:.2f}")) for c in ("Torque", "Draft", "Sinkage")]
+    rows: list[Row] = [("window", _cell(known, "SoilStrength", known.number("SoilStrength", "Chi2"), "{:.1f}"))]
+    for channel in ("Torque", "Draft", "Sinkage"):
+        chi2 = known.number("WindowQuality", f"Chi2{channel}")
+        rows.append((channel.lower(), _cell(known, "WindowQuality", chi2, "{:.2f}")))
     return grid(("gap (chi-square)", "1 is noise"), *rows)
 
 
 def _refused(dashboard: Dashboard) -> list[Text]:
     """Samples refused by the service, and frames of ours that we refused ourselves."""
     known = dashboard.known
-    share = "".join(_said(known, "SoilbusStatus", "RejectedShare", "{:.1f} % of samples")) or "-"
-    count, reason = known.number("WindowQuality", "Rejected"), known.value("WindowQuality", "RejectedReason")
-    window = "-" if count is None else f"{count:.0f}"
-    if count and isinstance(reason, str):
-        window += f", most {reason}"
-    missed = "".join(_said(known, "SoilbusStatus", "DeadlineMisses", "{:.0f}")) or "-"
-    rows: list[Row] = [
-        ("inputs", share),
-        ("in window", window),
-        ("late windows", missed),
+    count = known.number("WindowQuality", "Rejected")
+    most = _said(known, "WindowQuality", "RejectedReason", ", most {}") if count else ""
+    return grid(
+        ("refused", ""),
+        ("inputs", _said(known, "SoilbusStatus", "RejectedShare", "{:.1f} % of samples") or "-"),
+        ("in window", "-" if count is None else f"{count:.0f}{most}"),
+        ("late windows", _said(known, "SoilbusStatus", "DeadlineMisses", "{:.0f}") or "-"),
         ("bad frames", str(known.bad_frames)),
-    ]
-    return grid(("refused", ""), *rows)
+    )
 
 
 def _service(dashboard: Dashboard) -> list[Text]:
     """The service and its bus, by what the service says."""
     known = dashboard.known
-    state = "  ".join((*_said(known, "SoilbusStatus", "State", "{}"), *_said(known, "SoilbusStatus", "Reason", "({})")))
+    state = _said(known, "SoilbusStatus", "State", "{}") + _said(known, "SoilbusStatus", "Reason", "  ({})")
     version = [known.number("SoilbusIdentity", f"Version{part}") for part in ("Major", "Minor", "Patch")]
     shown = "-" if None in version else ".".join(f"{part:.0f}" for part in version)
-    shown += "".join(_said(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s"))
-    bus = "".join(_said(known, "BusHealth", "BusState", "{}")) or "-"
+    shown += _said(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s")
     counts = ((key.partition("_")[0], known.number("BusHealth", signal)) for signal, key in BUS_COUNTS.items())
     faults = [f"{what} {count:.0f}" for what, count in counts if count]
-    rows: list[Row] = [("state", state or "-"), ("version", shown), ("bus", bus)]
-    pairs = [" ".join(faults[i : i + 2]) for i in range(0, len(faults), 2)]
-    return grid(("service", ""), *rows, *(("", pair) for pair in pairs))
+    pairs = [("", " ".join(faults[i : i + 2])) for i in range(0, len(faults), 2)]
+    bus = _said(known, "BusHealth", "BusState", "{}") or "-"
+    return grid(("service", ""), ("state", state or "-"), ("version", shown), ("bus", bus), *pairs)
 
 
 BLOCKS: tuple[Callable[[Dashboard], list[Text]], ...] = (_soil, _wheels, _limits, _gap, _advice, _refused, _service)
@@ -218,21 +211,15 @@ def _chart(dashboard: Dashboard, name: str, width: int) -> str:
     return f"{CHARTS[name]:<12}{said:>8}  "[:LABEL] + sparkline(values)
 
 
-def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
+def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> str:
     """A value in words, nothing where it is not known."""
     value = known.value(message, signal)
-    if value is not None and value != "none":
-        yield form.format(value)
+    return "" if value is None or value == "none" else form.format(value)
 
 
-def _cell(known: ReceivedFrames, message: str, text: str | None) -> Text:
+def _cell(known: ReceivedFrames, message: str, value: object, form: str = "{}") -> Text:
     """Grey where the message must not be acted on; None: not known."""
-    return Text("-" if text is None else text, style="" if known.is_valid(message) else "dim")
-
-
-def _one(known: ReceivedFrames, message: str, signal: str, form: str, unit: float = 1.0) -> Text:
-    value = known.number(message, signal)
-    return _cell(known, message, None if value is None else form.format(value / unit))
+    return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
 
 
 def _pair(known: ReceivedFrames, message: str, signal: str, std: str | None = None) -> Text:

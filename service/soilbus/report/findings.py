@@ -1,17 +1,17 @@
-"""A diagnosis as `soilbus diagnose` prints it: JSON (keys: DESIGN.md) and text.
+"""A diagnosis as `soilbus diagnose` prints it: JSON (keys: docs/json.md) and text, which say the same.
 
-    Findings -> findings_json(), findings_text()
-
-Both say the same: verdict and sentence, places of disagreement, effects with parameters and alternatives, the gap
-before and after, and the soil of each recording before and after.  The sentences are made in `statement`.
+The sentences are made in `statement`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
+from soilbus.config.model import Config
+from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms
@@ -19,25 +19,28 @@ from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.diagnose import Findings
+from soilbus.offline.manoeuvre import MAX_REPEATS, Plan
 from soilbus.pipeline.outputs import PARAMETER_FRAMES, known, value_std, values_std
-from soilbus.report.next_drive import plan_lines
 from soilbus.report.statement import (
     doubt,
-    is_open,
     no_places,
-    pressure_error,
     same_push,
     shown_lines,
     statement,
+    tells,
+    unseen_errors,
     why_probabilities,
 )
 from soilbus.report.table import AT_EDGE, table, value_text
+from soilbus.simulator.manoeuvre import Manoeuvre
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.words import text_of
 
 MAX_PLACES = 8
 """Places of disagreement that the text lists."""
+PLACE = ("channel", "wheel", "region", "size", "significance", "log")
+"""What JSON says of a place of disagreement."""
 UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
 """Unit of each channel's residuals."""
 
@@ -57,15 +60,15 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "verdict": str(diagnosis.verdict),
         "sentence": statement(diagnosis),
         "doubt": doubt(diagnosis),
-        "where": [_place(place) for place in diagnosis.where],
-        "effects": [_effect(addition, findings.diagnosis.completed) for addition in diagnosis.additions],
+        "where": [{name: getattr(place, name) for name in PLACE} for place in diagnosis.where],
+        "effects": [_effect(addition, diagnosis.completed) for addition in diagnosis.additions],
         "gap": {
             "before": diagnosis.gap_before.value,
             "after": diagnosis.gap_after.value,
             "noise_floor": 1.0,
             "limit": diagnosis.gap_after.limit(),
             "residuals": diagnosis.gap_after.rows,
-            "open": is_open(diagnosis),
+            "open": diagnosis.gap_after.exceeds_noise(),
         },
         "solver": {
             "before": [str(fit.termination) for fit in diagnosis.base.fits],
@@ -76,15 +79,12 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "configured": {name: values_std(values) for name, values in diagnosis.base.prior_parameters().items()},
-        "model": {name: values_std(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "model": {name: values_std(values) for name, values in diagnosis.completed.parameters().items()},
         "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
         "learned": [
             {
-                "channel": description.channel,
-                "wheel": description.wheel,
-                "formula": description.formula,
+                **{name: getattr(description, name) for name in ("channel", "wheel", "formula", "explained")},
                 "terms": {term.regressor: term.coefficient for term in description.terms},
-                "explained": description.explained,
             }
             for description in diagnosis.residual_terms
         ],
@@ -103,23 +103,18 @@ def _shown(findings: Findings) -> dict[str, Any]:
     diagnosis = findings.diagnosis
     if not diagnosis.detectable:
         return {"could_show": None, "could_not_show": None, "unseen": None}
-    before = [diagnosis.soil_before(i) for i in range(len(diagnosis.base.fits))]
-    shown: list[dict[str, Any]] = []
-    unseen: list[dict[str, Any]] = []
-    for found in diagnosis.detectable:
-        of = {"name": found.effect.name, "parameter": found.parameter.name, "unit": found.parameter.unit}
-        if found.size is not None:
-            shown.append(of | {"size": found.size})
-        error, std = pressure_error(found, before, findings.config)
-        if abs(error) > std:
-            unseen.append(of | {"size": found.unseen, "bearing_pressure_error": error, "bearing_pressure_std": std})
-    hidden = [found.effect.name for found in diagnosis.detectable if found.size is None]
-    return {"could_show": shown, "could_not_show": hidden, "unseen": unseen}
 
+    def of(found: Detectable, **more: Any) -> dict[str, Any]:
+        return {"name": found.effect.name, "parameter": found.parameter.name, "unit": found.parameter.unit, **more}
 
-def _place(place: Disagreement) -> dict[str, Any]:
-    names = ("channel", "wheel", "region", "size", "significance", "log")
-    return {name: getattr(place, name) for name in names}
+    return {
+        "could_show": [of(found, size=found.size) for found in diagnosis.detectable if found.size is not None],
+        "could_not_show": [found.effect.name for found in diagnosis.detectable if found.size is None],
+        "unseen": [
+            of(found, size=found.unseen, bearing_pressure_error=error, bearing_pressure_std=std)
+            for found, error, std in unseen_errors(diagnosis, findings.config)
+        ],
+    }
 
 
 def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
@@ -171,7 +166,7 @@ def findings_text(findings: Findings) -> str:
     lines += [f"  {line}" for line in place_lines(findings)]
     lines += [*configured_lines(diagnosis), *shown_lines(diagnosis, findings.config)]
     for number, addition in enumerate(diagnosis.additions, 1):
-        lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+        lines += ["", *effect_lines(number, addition, diagnosis.completed)]
     if findings.plan is not None:
         lines += ["", *plan_lines(findings.plan)]
     if diagnosis.residual_terms:
@@ -197,7 +192,7 @@ def place_lines(findings: Findings) -> list[str]:
         return [no_places(findings.diagnosis)]
     has_several = len(findings.diagnosis.base.fits) > 1
     shown = [
-        f"{f'{p.log}: ' if has_several and p.log else ''}{_channel(p)}, {p.region}: {size_text(p)} "
+        f"{f'{p.log}: ' if has_several and p.log else ''}{_channel(p)}, {p.region}: {_size_text(p)} "
         f"(chance {f'{p.significance:.0e}' if p.significance > 0.0 else '< 1e-300'})"
         for p in where[:MAX_PLACES]
     ]
@@ -209,8 +204,7 @@ def _channel(place: Disagreement | ResidualTerms) -> str:
     return f"{place.channel}.{place.wheel}" if place.wheel else place.channel
 
 
-def size_text(place: Disagreement) -> str:
-    """The size of a disagreement in words."""
+def _size_text(place: Disagreement) -> str:
     if place.region == "scatter":
         return f"residuals {place.size:.2f} times the noise"
     if place.region == "gain":
@@ -227,12 +221,13 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
     lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]
     for name, estimate in completed.parameters()[effect.name].items():
         lines.append(f"   {name} = {value_text(estimate.value, estimate.std, AT_EDGE)}{_unit_of(name, effect)}")
-    lines += [f"   {line}" for line in filter(None, [same_push(addition, completed)])]
+    if same := same_push(addition, completed):
+        lines.append(f"   {same}")
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
         lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", f"   {why_probabilities(addition)}"]
         lines += ["   what would tell them apart:"]
-        lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
+        lines += [f"   - {line}" for line in tells([effect.name, *addition.alternatives])]
     return lines
 
 
@@ -272,3 +267,33 @@ def _soil_lines(findings: Findings) -> Iterator[str]:
                 rows.setdefault(name, []).append(value_text(of.value / size, of.std / size))
         head = (f"soil of {log}" if several else "soil", "before", "after")
         yield from table(head, [(name, *texts) for name, texts in rows.items()]).splitlines()
+
+
+def plan_lines(plan: Plan) -> list[str]:
+    """Return what to drive next, and what it is expected to settle."""
+    between, seconds = ", ".join(plan.between), plan.manoeuvre.duration
+    head = f"what to drive next, to decide between {between} ({seconds:.0f} s; --manoeuvre-out keeps it):"
+    return [head, f"  {plan.manoeuvre.words}", f"  {hope_of(plan)}"]
+
+
+def hope_of(plan: Plan) -> str:
+    """Return what a plan is expected to settle, and how often it must be driven."""
+    if plan.repeats is None:
+        return f"even {MAX_REPEATS} such drives are not expected to settle it: rather take one of the sensors above"
+    times = "once" if plan.repeats == 1 else f"{plan.repeats} times"
+    return f"driven {times} and diagnosed together with what there is, it is expected to settle the name"
+
+
+def excitation_lines(manoeuvre: Manoeuvre, expected: Posterior, now: Posterior, config: Config) -> list[str]:
+    """Return a manoeuvre, and the standard deviations of the soil that are expected after it."""
+    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
+    shares = []
+    for posterior in (now, expected):
+        pressure = posterior.bearing_pressure(z_ref, b_ref)
+        shares.append((100.0 * pressure.std / pressure.value, math.degrees(posterior.parameters()["phi"].std)))
+    (pressure_now, phi_now), (pressure_then, phi_then) = shares
+    return [
+        f"what to drive next ({manoeuvre.duration:.0f} s; --manoeuvre-out keeps it): {manoeuvre.words}",
+        f"  bearing pressure is known to +- {pressure_now:.2g} % and phi to +- {phi_now:.2g} deg; the sensors alone "
+        f"would then allow {pressure_then:.2g} % and {phi_then:.2g} deg",
+    ]

@@ -1,7 +1,6 @@
 """The frame that all HTML reports share: template, pictures inside the file, and what a report was made from.
 
-A report needs nothing but itself: pictures are PNG in base64, no script and no font is loaded, and a content security
-policy tells the browser to ask for nothing.  Needs jinja2 and matplotlib (extra: plots).
+A report needs nothing but itself: no script and no font is loaded, and a policy tells the browser to ask for nothing.
 """
 
 from __future__ import annotations
@@ -84,7 +83,13 @@ class Source:
         yield "soilbus", f"version {__version__}"
         yield "Recordings", ", ".join(self.names)
         yield "Configuration", self._configuration()
-        yield from _vehicle_rows(self.config)
+        if (vehicle := self.config.vehicle) is not None:
+            mass = f"{vehicle.mass:g} kg" + (f" ± {vehicle.mass_std:g} kg" if vehicle.mass_std else "")
+            ahead = f"centre of gravity {vehicle.cg_ahead_of_rear_axle:g} m ahead of the rear axle"
+            high = f"{vehicle.cg_height:g} m high, hitch {vehicle.hitch_height:g} m high"
+            yield "Vehicle", f"{mass}, wheelbase {vehicle.wheelbase:g} m, {ahead} and {high}"
+        alike = groupby(self.config.wheel, _text_of)
+        yield "Wheels", "; ".join(f"{', '.join(wheel.name for wheel in wheels)}: {text}" for text, wheels in alike)
         yield "Made", f"{self.made:%Y-%m-%d %H:%M} {self.made.tzname() or ''}".strip()
         yield "How to cite", CITATION.format(version=__version__)
 
@@ -106,24 +111,9 @@ class Source:
         return text + (f", with {', '.join(self.overrides)}" if self.overrides else "")
 
 
-def _vehicle_rows(config: Config) -> Iterator[tuple[str, str]]:
-    vehicle = config.vehicle
-    if vehicle is not None:
-        mass = f"{vehicle.mass:g} kg" + (f" ± {vehicle.mass_std:g} kg" if vehicle.mass_std else "")
-        yield (
-            "Vehicle",
-            (
-                f"{mass}, wheelbase {vehicle.wheelbase:g} m, centre of gravity {vehicle.cg_ahead_of_rear_axle:g} m "
-                f"ahead of the rear axle and {vehicle.cg_height:g} m high, hitch {vehicle.hitch_height:g} m high"
-            ),
-        )
-
-    def text_of(wheel: Wheel) -> str:
-        track = f", {wheel.contact_length:g} m of track on the ground" if wheel.contact_length else ""
-        return f"radius {wheel.radius:g} m, width {wheel.width:g} m{track}" + ("" if wheel.driven else ", not driven")
-
-    alike = groupby(config.wheel, text_of)
-    yield "Wheels", "; ".join(f"{', '.join(wheel.name for wheel in wheels)}: {text}" for text, wheels in alike)
+def _text_of(wheel: Wheel) -> str:
+    track = f", {wheel.contact_length:g} m of track on the ground" if wheel.contact_length else ""
+    return f"radius {wheel.radius:g} m, width {wheel.width:g} m{track}" + ("" if wheel.driven else ", not driven")
 
 
 def page(template: str, source: Source, **content: Any) -> str:

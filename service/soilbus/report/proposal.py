@@ -15,23 +15,11 @@ from typing import Any, NamedTuple
 
 import tomlkit
 from cantools.database.can import Database, Message
-from tomlkit import TOMLDocument
-from tomlkit.items import Table
 
 from soilbus.can.channels import WHOLE
 from soilbus.can.columns import unit_in
 from soilbus.can.mapping import DIMENSIONS, VEHICLE_ROLES
-from soilbus.can.role_matching import (
-    AXLES,
-    ONLY,
-    WHEELS,
-    Assignment,
-    Candidate,
-    Slot,
-    axles_of,
-    described,
-    is_word_in,
-)
+from soilbus.can.role_matching import AXLES, ONLY, WHEELS, Assignment, Candidate, Slot, axles_of, described, is_word_in
 from soilbus.can.validity import vouching_codes
 from soilbus.config.edit import toml_text
 from soilbus.config.file import OPEN
@@ -60,28 +48,24 @@ class Proposal(NamedTuple):
 
 @dataclass
 class _Draft:
-    """What is known of the vehicle, the document so far, and the signals that it maps or names."""
+    """What is known of the vehicle, the lines so far, and the signals that they map or name."""
 
     database: Database
     assignment: Assignment
     facts: Facts
-    document: TOMLDocument = field(default_factory=tomlkit.document)
+    lines: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     named: set[str] = field(default_factory=set)
     open: int = 0
 
     def __post_init__(self) -> None:
-        self._here: TOMLDocument | Table = self.document
         self.axles = axles_of(self.assignment)
 
     def put(self, key: str, value: Any, comment: str = "") -> None:
         """A key of the section, with a comment beside it."""
-        item = tomlkit.item(value)
-        self.open += _open_values(value)
-        if comment:
-            item.comment(shown(comment))
-            item.trivia.comment_ws = " " * max(2, COLUMN - len(f"{key} = {item.as_string()}"))
-        self._here.add(key, item)
+        line = f"{key} = {tomlkit.item(value).as_string()}"
+        self.open += line.count(f'"{OPEN}"')
+        self.lines.append(f"{line.ljust(max(len(line) + 2, COLUMN))}# {shown(comment)}" if comment else line)
 
     def put_open(self, key: str, comment: str) -> None:
         self.put(key, OPEN, comment)
@@ -93,21 +77,11 @@ class _Draft:
 
     def note(self, *texts: str, apart: bool = False) -> None:
         """A comment for each text, below an empty line where they stand apart."""
-        if apart:
-            self._here.add(tomlkit.nl())
-        for text in texts:
-            self._here.add(tomlkit.comment(shown(text)))
+        self.lines += [""] * apart + [f"# {shown(text)}" for text in texts]
 
     def section(self, name: str, repeated: bool = False) -> None:
         """Begin a section, or one more of that name."""
-        self._here = tomlkit.table()
-        self._here.trivia.indent = "\n"
-        if not repeated:
-            self.document.add(name, self._here)
-            return
-        if name not in self.document:
-            self.document.add(name, tomlkit.aot())
-        self.document[name].append(self._here)
+        self.lines += ["", f"[[{name}]]" if repeated else f"[{name}]"]
 
     def matched(self, role: str, place: str = "") -> Candidate | None:
         return self.assignment.asserted.get(Slot(role, place))
@@ -147,11 +121,6 @@ class _Draft:
         self.put(key, value if len(value) > 1 else c.path, "; ".join(remarks))
 
 
-def _open_values(value: Any) -> int:
-    """The number of values that are open in one of the file."""
-    return sum(map(_open_values, value.values())) if isinstance(value, Mapping) else int(value == OPEN)
-
-
 def proposal(
     database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str, time: str = ""
 ) -> Proposal:
@@ -176,26 +145,16 @@ def proposal(
         if time:
             draft.put("time", time)
     _put_vehicle(draft)
-    layout = _layout_of(draft)
-    for axle in layout.axles:
+    axles, driven = _layout_of(draft)
+    for axle in axles:
         _put_axle(draft, axle)
     for axle, wheels in draft.axles.items():
         for wheel in wheels:
-            _put_wheel(draft, wheel, axle, layout)
+            _put_wheel(draft, wheel, axle, driven)
     _put_signals(draft)
     _put_rest(draft)
-    return Proposal(toml_text(draft.document), len(draft.used), draft.open)
-
-
-# --- which motor drives what ---
-
-
-class _Layout(NamedTuple):
-    """Axles that have a section, "" for one motor of an unknown axle; wheels and axles with a torque."""
-
-    axles: tuple[str, ...]
-    wheels_driven: frozenset[str]
-    axles_driven: frozenset[str]
+    text = toml_text(tomlkit.parse("\n".join(draft.lines) + "\n"))
+    return Proposal(text, len(draft.used), draft.open)
 
 
 def _one_layout(assignment: Assignment) -> Assignment:
@@ -211,38 +170,30 @@ def _one_layout(assignment: Assignment) -> Assignment:
     return Assignment(asserted, left, assignment.rivals, assignment.unnamed)
 
 
-def _layout_of(draft: _Draft) -> _Layout:
+def _layout_of(draft: _Draft) -> tuple[list[str], set[str]]:
+    """Axles that have a section, "" for one motor of an unknown axle; places of the torques."""
     asserted = draft.assignment.asserted
     at = {place for role, place in asserted if role == "torque"}
     if not at:  # one open candidate for each axle, or one for the vehicle: motors of axles all the same
         own = {slot.place: cs for slot, cs in draft.assignment.open.items() if slot.role == "torque"}
         if own.keys() <= {"", *AXLES} and all(len(cs) == 1 for cs in own.values()):
             at = set(own)
+    if "" in at and draft.facts.axle:
+        at = {draft.facts.axle}
     loads = {place for role, place in asserted if role == "load" and place in AXLES}
     if all(draft.matched("load", wheel) for wheels in draft.axles.values() for wheel in wheels):
         loads = set()  # one measurement, not two
-    driven = at & set(AXLES)
     named = set(draft.axles) if len(draft.axles) > 2 else set()
-    axles = [axle for axle in AXLES if axle in driven | loads | named]
-    if "" in at:
-        if draft.facts.axle:
-            driven = {draft.facts.axle}
-            axles = [axle for axle in AXLES if axle in driven | loads | named]
-        else:
-            axles.append("")
-    return _Layout(tuple(axles), frozenset(at & WHEELS), frozenset(driven))
-
-
-# --- sections ---
+    return [axle for axle in AXLES if axle in at | loads | named] + [""] * ("" in at), at
 
 
 def _put_vehicle(draft: _Draft) -> None:
     draft.section("vehicle")
-    mass = f"; the loads sum to {draft.facts.mass:.0f} kg in the log" if math.isfinite(draft.facts.mass) else ""
+    facts = draft.facts
+    mass = f"; the loads sum to {facts.mass:.0f} kg in the log" if math.isfinite(facts.mass) else ""
     draft.put_open("mass", f"kg with ballast, tank and driver{mass}")
-    if len(draft.axles) == 2:
-        ends, share = "front to rear axle", "wheelbase * load of the front axle / weight"
-    else:
+    ends, share = "front to rear axle", "wheelbase * load of the front axle / weight"
+    if len(draft.axles) != 2:
         ends, share = "first to last axle", "sum of each axle's load * its distance to the last one / weight"
     draft.put_open("wheelbase", f"m, {ends}")
     draft.put_open("cg_ahead_of_rear_axle", f"m, centre of gravity: {share}")
@@ -288,7 +239,7 @@ def _put_axle(draft: _Draft, axle: str) -> None:
         draft.put_signal("load", load)
 
 
-def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
+def _put_wheel(draft: _Draft, wheel: str, axle: str, driven: set[str]) -> None:
     draft.section("wheel", repeated=True)
     draft.put("name", wheel)
     draft.put("axle", axle)
@@ -298,13 +249,13 @@ def _put_wheel(draft: _Draft, wheel: str, axle: str, layout: _Layout) -> None:
     draft.put_open("width", "m, of the tyre")
     torque, speed = draft.matched("torque", wheel), draft.matched("speed", wheel)
     motor = draft.matched("motor_speed", wheel)
-    by_axle = bool(layout.axles_driven & {axle, "both"})
+    by_axle = bool(driven & {axle, "both"})
     if motor is not None or (torque is not None and not _is_at_wheel(torque)):
         _put_gear(draft, wheel)
     if torque is not None:
         draft.put_signal("torque", torque)
         _put_limit(draft, torque, "wheel")
-    elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
+    elif not by_axle and driven:
         draft.put_open("driven", "true or false: no torque of it was found")
     elif not by_axle:
         known = _of_role(draft, "torque", wheel)
@@ -403,9 +354,6 @@ def _put_rest(draft: _Draft) -> None:
         draft.note("In the DBC, but never in the log:", *lines, apart=True)
 
 
-# --- words ---
-
-
 def _of_role(draft: _Draft, role: str, place: str = "") -> list[Candidate]:
     """Candidates of an open slot, else those of the role wherever they are, else what has a unit of it there."""
     own = draft.assignment.open.get(Slot(role, place))
@@ -426,8 +374,8 @@ def _kind_by_words(database: Database, c: Candidate) -> str:
     comment = (database.get_message_by_name(c.message).get_signal_by_name(c.signal).comment or "").casefold()
     if "without gravity" in comment:
         return "kinematic"
-    is_force = is_word_in(c, "force") or is_word_in(c, "specific")
-    return "specific_force" if is_force or "specific force" in comment else ""
+    is_force = is_word_in(c, "force", "specific") or "specific force" in comment
+    return "specific_force" if is_force else ""
 
 
 _OTHER_WAY: Mapping[str, str] = {

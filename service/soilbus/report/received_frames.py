@@ -3,9 +3,8 @@
     stale    if  age > 3 cycle times + 0.2 s
     verdict   =  unknown or no_go as the last frame says it, else the least of the last five frames in a row
 
-The rules are those of dbc/README.md: a frame with a wrong checksum, a repeated counter or no layout counts as not
-received; a value outside the signal's range, not available or an error is None. The same counter with another payload
-shows a second sender.
+These are rules of dbc/README.md: a frame with a wrong checksum or a repeated counter is not received, one counter with
+two payloads shows a second sender, and a value out of range, not available or an error is None.
 """
 
 from __future__ import annotations
@@ -117,7 +116,7 @@ class ReceivedFrames:
         return self._clock() - seen if math.isfinite(seen) else None
 
     def is_stale(self, message: str) -> bool:
-        """Return whether no good frame came for CYCLES_UNTIL_STALE cycles, or none at all."""
+        """Return whether the last good frame is too old, or there is none."""
         return self._streams[message].is_stale(self._clock())
 
     def receive(self, message: Received | can.Message) -> None:
@@ -127,22 +126,17 @@ class ReceivedFrames:
             return
         place = checkable_byte(layout)
         data = bytes(message.data)
-        if message.is_fd or (place is not None and data[place] != frame_checksum(message.arbitration_id, data, place)):
-            self.bad_frames += 1
-            return
+        is_wrong = place is not None and data[place] != frame_checksum(message.arbitration_id, data, place)
         try:
             values: dict[str, Any] = layout.decode(data)  # type: ignore[assignment]
         except (DecodeError, ValueError):  # an output.dbc of the user's may have multiplexers
-            self.bad_frames += 1
-            return
-        if not self._streams[layout.name].take(self._clock(), data, values):
+            is_wrong = True
+        if message.is_fd or is_wrong or not self._streams[layout.name].take(self._clock(), data, values):
             self.bad_frames += 1
 
     def value(self, message: str, signal: str) -> float | str | None:
         """Return a signal's value, or its name in the value table.
 
-        Returns
-        -------
         None where the frame is stale or has a second sender, or the value is not available, an error or reserved.
         """
         stream, now = self._streams[message], self._clock()
@@ -178,9 +172,9 @@ class ReceivedFrames:
 
     def is_valid(self, message: str) -> bool:
         """Return whether a message may be acted on: fresh, of one sender, its Status (if any) valid."""
-        status = self.value(message, "Status")
-        has_status = "Status" in self._signals[message]
-        return not self.has_second_sender and (status == "valid" if has_status else not self.is_stale(message))
+        if "Status" in self._signals[message]:
+            return not self.has_second_sender and self.value(message, "Status") == "valid"
+        return not self.has_second_sender and not self.is_stale(message)
 
 
 def _is_reserved(signal: Signal, value: float) -> bool:

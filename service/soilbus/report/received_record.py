@@ -9,7 +9,7 @@ from typing import Any
 
 from soilbus.pipeline.outputs import PARAMETER_FRAMES, known
 from soilbus.report.dashboard import Dashboard
-from soilbus.report.received_frames import BUS_COUNTS, ReceivedFrames
+from soilbus.report.received_frames import BUS_COUNTS
 
 
 def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
@@ -19,6 +19,11 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
     """
     received, wheels = dashboard.known, dashboard.wheels()
     number, value = received.number, received.value
+
+    def both(message: str, name: str, std: str = "", unit: float = 1.0) -> dict[str, float | None]:
+        values = number(message, name), number(message, std or f"{name}Std")
+        return {key: _times(x, unit) for key, x in zip(("value", "std"), values, strict=True)}
+
     verdict, kind = value("Traversability", "State"), value("SoilClass", "Kind")
     record: dict[str, Any] = {
         "t": t,
@@ -26,11 +31,8 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         "status": value("SoilStrength", "Status"),
         "state": value("SoilbusStatus", "State"),
         "reason": value("SoilbusStatus", "Reason"),
-        "soil": {
-            name: _value_std(received, message, "Value", unit, "Std")
-            for name, (message, _, unit) in PARAMETER_FRAMES.items()
-        },
-        "bearing_pressure": _value_std(received, "SoilStrength", "BearingPressure", 1e3),
+        "soil": {name: both(message, "Value", "Std", unit) for name, (message, _, unit) in PARAMETER_FRAMES.items()},
+        "bearing_pressure": both("SoilStrength", "BearingPressure", unit=1e3),
         "soil_class": None
         if kind is None
         else {str(kind): number("SoilClass", "Probability"), "unknown": number("SoilClass", "UnknownProbability")},
@@ -41,15 +43,15 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
             "probability": number("Traversability", "Probability"),
             "torque_required": number("TorqueDemand", "TorqueRequired"),
             "torque_available": number("TorqueDemand", "TorqueAvailable"),
-            "max_draft": _value_std(received, "DraftCapability", "MaxDraft"),
-            "max_grade": _value_std(received, "GradeCapability", "MaxGrade"),
+            "max_draft": both("DraftCapability", "MaxDraft"),
+            "max_grade": both("GradeCapability", "MaxGrade"),
             "limit": value("Traversability", "LimitingCause"),
             "age": number("Traversability", "Age"),
             "since_valid": number("Traversability", "SinceValid"),
         },
         "capability": {
-            "max_draft_here": _value_std(received, "TractionLimits", "MaxDraft"),
-            "max_grade_with_draft": _value_std(received, "TractionLimits", "MaxGrade"),
+            "max_draft_here": both("TractionLimits", "MaxDraft"),
+            "max_grade_with_draft": both("TractionLimits", "MaxGrade"),
             "set_points": {
                 axle.lower(): {
                     "efficiency": {"value": number("TractionAdvice", f"SlipForEfficiency{axle}"), "std": None},
@@ -57,7 +59,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
                 }
                 for axle in ("Front", "Rear")
             },
-            "forecast": {"slip": _value_std(received, "DemandForecast", "Slip")},
+            "forecast": {"slip": both("DemandForecast", "Slip")},
         },
         "warning": {
             "state": value("DemandForecast", "Warning") or "unknown",
@@ -79,14 +81,6 @@ def gist(record: dict[str, Any]) -> tuple[Any, ...]:
     """Return the window and the states of a record, whose change is worth a line."""
     of_window = (record[key] for key in ("window", "status", "state", "reason", "fault", "second_sender"))
     return (*of_window, record["traversability"]["state"], record["warning"]["state"])
-
-
-def _value_std(
-    received: ReceivedFrames, message: str, value: str, unit: float = 1.0, std: str = ""
-) -> dict[str, float | None]:
-    """A value and its standard deviation, each times the SI value of one unit of the DBC."""
-    names = {"value": value, "std": std or f"{value}Std"}
-    return {key: _times(received.number(message, name), unit) for key, name in names.items()}
 
 
 def _whole(value: float | None) -> int | None:

@@ -11,7 +11,6 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.result import WindowResult
-from soilbus.report.advice import advice, of_use
 from soilbus.report.configuration import no_slope
 from soilbus.report.page import Picture, Source, Step, page
 from soilbus.report.replay_pictures import (
@@ -22,12 +21,17 @@ from soilbus.report.replay_pictures import (
     map_pictures,
     run_pictures,
 )
-from soilbus.report.windows import by_reason, machine_line, why_of_no_use
+from soilbus.report.windows import advice, by_reason, machine_line, of_use, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
     """Return the whole page of a replay, with the text of its summary."""
-    shown = list(_pictures(results, source.config))
+    config, shown = source.config, list[tuple[str, Picture]]()
+    if results and config.table is not None:
+        shown = list(run_pictures(results))
+    elif results:
+        decision = "May the tractor go on, and how much could it pull?", decision_picture(results, config)
+        shown = [decision, *map_pictures(results), *curve_pictures(results, config)]
     curves = (
         "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate; its band is"
         " 95 % wide."
@@ -36,27 +40,15 @@ def replay_report(results: Sequence[WindowResult], text: str, source: Source) ->
         "replay.html",
         source,
         command="replay",
-        headline=headline(results, source.config),
+        headline=headline(results, config),
         paragraphs=[" ".join(sentences(results))],
         pair=shown[:2],
         sections=[("Soil and wheels", curves, shown[2:])],
         steps=list(next_steps(results, source)),
-        config=source.config,
+        config=config,
         details="Counts of windows, samples and refusals",
         text=text,
     )
-
-
-def _pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
-    """Captions and pictures, those of the first screen first."""
-    if not results:
-        return
-    if config.table is not None:
-        yield from run_pictures(results)
-        return
-    yield "May the tractor go on, and how much could it pull?", decision_picture(results, config)
-    yield from map_pictures(results)
-    yield from curve_pictures(results, config)
 
 
 def headline(results: Sequence[WindowResult], config: Config) -> str:
@@ -113,8 +105,7 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[Step
     config = source.config
     good = [r for r in results if r.status is Status.VALID]
     for (status, reason), group in by_reason(results):
-        what = advice(group, good)
-        if what is not None:
+        if what := advice(group, good):
             why = reason.removeprefix(f"{status} ").replace("_", " ")
             yield Step(f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.")
     if any(r.reason.split()[0] in ("model_mismatch", "no_convergence") for r in results):

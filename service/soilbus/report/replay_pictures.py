@@ -21,16 +21,14 @@ from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.posterior import Estimate
 from soilbus.pipeline.result import WindowResult, is_date
-from soilbus.report.advice import of_use
 from soilbus.report.page import Picture, picture
+from soilbus.report.windows import of_use
 from soilbus.terra.earth import offset
 
 SPACE_BETWEEN = 0.03
 """Space between two recordings in a picture, as a share of the time of all."""
 TICKS = 5
 """Ticks of a time axis: as many clock times as fit side by side."""
-LABELLED_SHARE = 0.13
-"""Share of a ribbon's length from which a segment has its name in it."""
 FEW_WINDOWS = 200
 """Windows up to which each has its dot on a curve."""
 BAND_SD = 2.0
@@ -91,27 +89,24 @@ class TimeAxis:
     """Time axis with recordings one after the other; a window's decision stands for `hop` [s]."""
 
     def __init__(self, results: Sequence[WindowResult], hop: float) -> None:
-        self.parts = stretches(results)
-        self.hop, self._results = hop, results
-        lengths = [part[-1].t - part[0].t + hop for part in self.parts]
-        self.length = sum(lengths)
-        space = SPACE_BETWEEN * self.length
-        begins = np.concatenate([[0.0], np.cumsum(lengths) + space * np.arange(1, len(lengths) + 1)])
-        self.shift = [begin - (part[0].t - hop) for begin, part in zip(begins.tolist(), self.parts, strict=False)]
-        self.end = float(begins[-1] - space)
+        self.parts, self.hop, self._results = stretches(results), hop, results
+        lengths = np.array([part[-1].t - part[0].t + hop for part in self.parts])
+        self.space = SPACE_BETWEEN * float(lengths.sum())
+        self.begins = (np.cumsum(lengths) - lengths + self.space * np.arange(len(lengths))).tolist()
+        self.shift = [begin - (part[0].t - hop) for begin, part in zip(self.begins, self.parts, strict=True)]
+        self.end = self.begins[-1] + float(lengths[-1])
 
     def curve(self, of: Callable[[WindowResult], Any], columns: int = 1) -> Array:
         """Return the columns time and values (N, 1 + columns) of all windows; nan breaks the line at None."""
+        gap = [math.nan] * columns
         rows: list[list[float]] = []
         for part, shift in zip(self.parts, self.shift, strict=True):
             last = -math.inf
             for r in part:
                 if r.t - last > 1.5 * self.hop:
-                    rows.append([r.t + shift] + [math.nan] * columns)
-                value = of(r)
-                known = [math.nan] * columns if value is None else np.atleast_1d(value).tolist()
-                rows.append([r.t + shift, *known])
-                last = r.t
+                    rows.append([r.t + shift, *gap])
+                value, last = of(r), r.t
+                rows.append([r.t + shift, *(gap if value is None else np.atleast_1d(value).tolist())])
         return np.array(rows)
 
     def segments(self, of: Callable[[WindowResult], Any]) -> Iterator[tuple[Any, float, float]]:
@@ -126,13 +121,12 @@ class TimeAxis:
         """Draw ticks with clock times, and a rule between recordings."""
         day = dates(self._results)
         places = np.linspace(0.0, self.end, TICKS)
-        begins = [part[0].t - self.hop + shift for part, shift in zip(self.parts, self.shift, strict=True)]
-        of_part = np.maximum(np.searchsorted(begins, places, "right") - 1, 0)
+        of_part = np.maximum(np.searchsorted(self.begins, places, "right") - 1, 0)
         stamps = [x - self.shift[i] for x, i in zip(places, of_part, strict=True)]
         axis.set_xlim(0.0, 1.01 * self.end)
         axis.set_xticks(places, [clock_text(round(t)).removesuffix(" s") for t in stamps])
-        for begin in begins[1:]:
-            axis.axvline(begin - SPACE_BETWEEN * self.length / 2.0, color="0.4", lw=0.8, ls=":")
+        for begin in self.begins[1:]:
+            axis.axvline(begin - self.space / 2.0, color="0.4", lw=0.8, ls=":")
         axis.set_xlabel(f"UTC, {day}" if day else "time of the log, s")
 
 
@@ -144,10 +138,8 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
 
     def draw(figure: Any) -> None:
         state, status, axis = figure.subplots(3, 1, sharex=True, height_ratios=[0.16, 0.1, 1.0])
-        unnamed = _ribbon(state, time, lambda r: STATES[r.traversability.state], True)
-        unnamed |= _ribbon(status, time, lambda r: STATUSES[r.status], True)
-        state.set_ylabel("may go on", rotation=0, ha="right", va="center", fontsize=9.5)
-        status.set_ylabel("estimate", rotation=0, ha="right", va="center", fontsize=9.5)
+        looks = _ribbon(state, time, lambda r: STATES[r.traversability.state], "may go on")
+        looks |= _ribbon(status, time, lambda r: STATUSES[r.status], "estimate")
         if any(r.traversability.max_draft for r in of_use(results)):
             _band(axis, time, lambda r: r.traversability.max_draft, 1e3, "largest possible, on the level")
         pulled = time.curve(lambda r: r.excitation.draft)
@@ -169,12 +161,9 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
             axis.set_yticks([])
         time.dress(axis)
         handles = [
-            Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4, label=look.name)
-            for look in (*STATES.values(), *STATUSES.values())
-            if look in unnamed
+            Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4, label=look.name) for look in looks
         ]
-        if handles:
-            figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4), frameon=False)
+        figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
 
     words = "over time: may the tractor go on, quality of the estimate, draft pulled and largest possible draft"
     return picture(draw, 4.0, words)
@@ -186,27 +175,24 @@ def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[
     plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
     firm = f"How firm is the ground? Pressure that carries {plate}."
     agreement = "How well do model and sensors agree? At 1 as well as the sensors’ noise allows."
-    curves: list[tuple[str, str, str, Callable[[Any], None]]] = []
+
+    def draw_gap(axis: Any) -> None:
+        _band(axis, time, lambda r: None if r.chi2 is None else Estimate(math.sqrt(r.chi2), 0.0), 1.0)
+        axis.axhline(1.0, color="0.3", lw=1.0, ls="--")
+        low, high = axis.get_ylim()
+        axis.set_ylim(min(low, 0.5), max(high, 1.5))
+
     if of_use(results):
-        curves += [
-            (firm, "bearing pressure, kPa", "bearing pressure", lambda a: _band(a, time, lambda r: r.bearing, 1e3)),
-            (
-                HOLD.format("does the ground"),
-                "friction angle, °",
-                "friction angle",
-                lambda a: _band(a, time, *FRICTION),
-            ),
-            (agreement, "model’s error, × noise", "misfit of the model", lambda a: _draw_gap(a, time)),
-        ]
-    for caption, quantity, label, unit in (
-        ("How much does each wheel slip?", "slip", "slip, %", 0.01),
-        ("How deep does each wheel sink, by the estimated soil?", "sinkage", "sinkage, mm", 1e-3),
+        yield firm, _over_time(time, "bearing pressure, kPa", lambda a: _band(a, time, lambda r: r.bearing, 1e3))
+        yield HOLD.format("does the ground"), _over_time(time, "friction angle, °", lambda a: _band(a, time, *FRICTION))
+        yield agreement, _over_time(time, "model’s error, × noise", draw_gap)
+    for caption, label, quantity, unit in (
+        ("How much does each wheel slip?", "slip of each wheel, %", "slip", 0.01),
+        ("How deep does each wheel sink, by the estimated soil?", "sinkage of each wheel, mm", "sinkage", 1e-3),
     ):
         if any(value is not None for r in results for value in getattr(r, quantity).values()):
             draw = partial(_draw_wheels, time=time, wheels=list(results[0].slip), quantity=quantity, unit=unit)
-            curves.append((caption, label, f"{quantity} of each wheel", draw))
-    for caption, label, words, draw_curve in curves:
-        yield caption, _over_time(time, label, draw_curve, words)
+            yield caption, _over_time(time, label, draw)
 
 
 def run_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
@@ -234,43 +220,66 @@ def run_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
 def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
     """Yield the caption and picture of the route by decision; none without positions."""
     placed = [r for r in results if r.position is not None]
-    if len(placed) > 1:
-        words = "map of the route, coloured by decision"
-        yield "The route by decision.", picture(lambda figure: _draw_map(figure, placed), 4.0, words)
+    if len(placed) < 2:
+        return
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        latitude, longitude = np.array([r.position for r in placed]).T
+        first = float(latitude[0]), float(longitude[0])
+        north, east = offset(*first, latitude, longitude)
+        begin = 0
+        for part in stretches(placed):
+            end = begin + len(part)
+            axis.plot(east[begin:end], north[begin:end], "-", color="0.6", lw=0.8, zorder=1)
+            begin = end
+        at = np.column_stack([east, north])
+        for state, look in STATES.items():
+            here = at[[r.traversability.state is state for r in placed]]
+            if len(here):
+                axis.scatter(
+                    *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
+                )
+        axis.legend(loc="best")
+        axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.margins(0.08)
+        place = ", ".join(
+            f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
+            for i, angle in enumerate(first)
+        )
+        axis.set_xlabel(f"m east of the start ({place})")
+        axis.set_ylabel("m north")
+
+    yield "The route by decision.", picture(draw, 4.0, "map of the route, coloured by decision")
 
 
-def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None], words: str) -> Picture:
+def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None]) -> Picture:
     """A curve under a thin ribbon of the decision."""
 
     def draw(figure: Any) -> None:
         ribbon, axis = figure.subplots(2, 1, sharex=True, height_ratios=[0.07, 1.0])
-        _ribbon(ribbon, time, lambda r: STATES[r.traversability.state], False)
+        _ribbon(ribbon, time, lambda r: STATES[r.traversability.state])
         draw_curve(axis)
         axis.set_ylabel(label)
         time.dress(axis)
 
-    return picture(draw, 3.2, f"{words} over time")
+    return picture(draw, 3.2, f"{label.partition(',')[0]} over time")
 
 
-def _ribbon(axis: Any, time: TimeAxis, look_of: Callable[[WindowResult], Look], named: bool) -> set[Look]:
-    """Draw segments, each with its name where there is room for it; returns the looks that are named nowhere."""
+def _ribbon(axis: Any, time: TimeAxis, look_of: Callable[[WindowResult], Look], label: str = "") -> set[Look]:
+    """Draw a segment for each run of windows with one look; returns the looks."""
     seen: set[Look] = set()
-    written: set[Look] = set()
     for look, begin, length in time.segments(look_of):
         axis.broken_barh([(begin, length)], (0, 1), facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4)
         seen.add(look)
-        if named and length > LABELLED_SHARE * time.end:
-            written.add(look)
-            axis.text(
-                begin + length / 2.0, 0.47, look.name, ha="center", va="center", fontsize=9.5,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.2, "alpha": 0.85},
-            )  # fmt: skip
+    axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=9.5)
     axis.set_ylim(0, 1)
     axis.set_yticks([])
     axis.grid(False)
     axis.spines[:].set_visible(False)
     axis.tick_params(bottom=False, labelbottom=False)
-    return seen - written
+    return seen
 
 
 def _band(
@@ -289,45 +298,9 @@ def _band(
         axis.set_ylim(bottom=max(axis.get_ylim()[0], 0.0))
 
 
-def _draw_gap(axis: Any, time: TimeAxis) -> None:
-    _band(axis, time, lambda r: None if r.chi2 is None else Estimate(math.sqrt(r.chi2), 0.0), 1.0)
-    axis.axhline(1.0, color="0.3", lw=1.0, ls="--")
-    low, high = axis.get_ylim()
-    axis.set_ylim(min(low, 0.5), max(high, 1.5))
-
-
 def _draw_wheels(axis: Any, time: TimeAxis, wheels: Sequence[str], quantity: str, unit: float) -> None:
     styles = ("-", "--", "-.", ":")
     for i, wheel in enumerate(wheels):
         t, value = time.curve(lambda r, wheel=wheel: getattr(r, quantity)[wheel]).T  # type: ignore[misc]
         axis.plot(t, value / unit, styles[i % 4], color=f"C{i}", lw=1.4, label=wheel)
     axis.legend(ncols=4, loc="best")
-
-
-def _draw_map(figure: Any, placed: Sequence[WindowResult]) -> None:
-    axis = figure.subplots()
-    latitude, longitude = np.array([r.position for r in placed]).T
-    first = float(latitude[0]), float(longitude[0])
-    north, east = offset(*first, latitude, longitude)
-    begin = 0
-    for part in stretches(placed):
-        members = slice(begin, begin + len(part))
-        axis.plot(east[members], north[members], "-", color="0.6", lw=0.8, zorder=1)
-        begin += len(part)
-    at = np.column_stack([east, north])
-    for state, look in STATES.items():
-        here = at[[r.traversability.state is state for r in placed]]
-        if len(here):
-            axis.scatter(
-                *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
-            )
-    axis.legend(loc="best")
-    axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.margins(0.08)
-    place = ", ".join(
-        f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
-        for i, angle in enumerate(first)
-    )
-    axis.set_xlabel(f"m east of the start ({place})")
-    axis.set_ylabel("m north")

@@ -1,14 +1,12 @@
 """A diagnosis in sentences, which text, page and JSON print alike.
 
-    sentence = f(verdict, effects added, gap that remains, places of disagreement)
-
-Each sentence depends on all four at once, so that no two of them contradict each other.
+Each depends on verdict, effects added, gap that remains and places of disagreement at once, so no two contradict.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -26,19 +24,13 @@ from soilbus.terra.vehicle import GRAVITY
 
 MAX_UNSEEN = 3
 """Effects that may be there unseen that the text lists."""
-UNSEEN = "what they could not have shown"
-
-
-def is_open(diagnosis: Diagnosis) -> bool:
-    """Whether the gap that remains is above that of noise alone."""
-    return diagnosis.gap_after.exceeds_noise()
 
 
 def statement(diagnosis: Diagnosis) -> str:
     """One line: what was found, and whether a gap remains."""
     names = [addition.effect.name for addition in diagnosis.additions]
     text, gap = _found(diagnosis, names), diagnosis.gap_after
-    if diagnosis.verdict is Verdict.UNKNOWN or not is_open(diagnosis):
+    if diagnosis.verdict is Verdict.UNKNOWN or not diagnosis.gap_after.exceeds_noise():
         return text
     left = "; something is left besides" if names else ""
     return f"{text}{left}: the gap of {gap.value:.2f} is above {gap.limit():.2f}"
@@ -46,7 +38,7 @@ def statement(diagnosis: Diagnosis) -> str:
 
 def disagrees(diagnosis: Diagnosis) -> bool:
     """Whether something disagrees by more than noise: single places, or all together."""
-    return bool(diagnosis.where) or is_open(diagnosis)
+    return bool(diagnosis.where) or diagnosis.gap_after.exceeds_noise()
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -65,10 +57,8 @@ def _named(addition: Addition) -> str:
     names = [addition.effect.name, *addition.alternatives]
     if addition.probability >= DEFAULT.named_probability or len(names) == 1:
         return names[0]
-    if len(names) == 2:
-        return " or ".join(names)
-    others = names[2] if len(names) == 3 else f"one of {len(names) - 2} others"
-    return f"{names[0]}, {names[1]} or {others}"
+    *most, last = names if len(names) <= 3 else [*names[:2], f"one of {len(names) - 2} others"]
+    return f"{', '.join(most)} or {last}"
 
 
 def plain_gap(diagnosis: Diagnosis) -> str:
@@ -84,13 +74,17 @@ def to_tell_apart(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
     """What to drive or measure next: a sentence, and a line for each effect."""
     sure = [addition.effect.name for addition in diagnosis.additions if not addition.alternatives]
     if sure:
-        yield f"What would confirm {'it' if len(sure) == 1 else 'them'}:", [f"{n}: {CATALOGUE[n].tells}" for n in sure]
+        yield f"What would confirm {'it' if len(sure) == 1 else 'them'}:", tells(sure)
     for addition in diagnosis.additions:
         if addition.alternatives:
-            names = [addition.effect.name, *addition.alternatives]
-            yield "What would tell these apart:", [f"{name}: {CATALOGUE[name].tells}" for name in names]
-    if hidden := [found.effect for found in diagnosis.detectable if found.size is None]:
-        yield "What these recordings could not show, and what would:", [f"{e.name}: {e.tells}" for e in hidden]
+            yield "What would tell these apart:", tells([addition.effect.name, *addition.alternatives])
+    if hidden := [found.effect.name for found in diagnosis.detectable if found.size is None]:
+        yield "What these recordings could not show, and what would:", tells(hidden)
+
+
+def tells(names: Iterable[str]) -> list[str]:
+    """What shows each effect, a line for each."""
+    return [f"{name}: {CATALOGUE[name].tells}" for name in names]
 
 
 def _found(diagnosis: Diagnosis, names: Sequence[str]) -> str:
@@ -99,15 +93,11 @@ def _found(diagnosis: Diagnosis, names: Sequence[str]) -> str:
         if disagrees(diagnosis):
             return "no effect explains enough to be added, though model and data disagree by more than noise"
         return "model and data agree: nothing is missing that these recordings could have shown"
+    missing = "effects are missing" if several else "an effect is missing"
     if verdict is Verdict.NAMED:
-        return (
-            "effects are missing, and the data tell which"
-            if several
-            else "an effect is missing, and the data tell which"
-        )
+        return f"{missing}, and the data tell which"
     if verdict is Verdict.AMBIGUOUS:
-        who = "effects are missing" if several else "an effect is missing"
-        return f"{who}, and the data do not tell for sure which"
+        return f"{missing}, and the data do not tell for sure which"
     none = "no effect that was tried" if diagnosis.base.held else "no effect of the catalogue"
     if not names:
         return f"something is missing that {none} explains"
@@ -119,34 +109,30 @@ def no_places(diagnosis: Diagnosis) -> str:
     """The sentence where no single place of disagreement stands out."""
     if diagnosis.additions or diagnosis.verdict is not Verdict.NONE:
         return "no single place stands out from noise: what is missing shows in all of them together"
-    if is_open(diagnosis):
+    if diagnosis.gap_after.exceeds_noise():
         return "no single place stands out from noise: all of them together do"
     return "no channel disagrees with the model anywhere by more than noise"
 
 
 def doubt(diagnosis: Diagnosis) -> str | None:
-    """Why the finding is doubtful, or None.
-
-    Open fits, sizes at an edge, effects that explain the data only together, effects that were not tried.
-    """
-    open_fit = None  # it has too little evidence, so that each effect seems to explain too much beside it
-    if not diagnosis.base.converged:
-        open_fit = "the fit of the present model did not converge, so evidence and names are a list of what to check"
-        open_fit += ", no finding"
-    reasons = open_fit, _at_limits(diagnosis), _imitation(diagnosis), _held(diagnosis)
-    found = [text for text in reasons if text is not None]
-    return "to be doubted: " + "; ".join(found) if found else None
-
-
-def _at_limits(diagnosis: Diagnosis) -> str | None:
-    """A size that is possible only just, and would be larger: the formula is bent to what the catalogue lacks."""
+    """Why the finding is doubtful, or None."""
+    found = []
+    if not diagnosis.base.converged:  # it has too little evidence, so each effect seems to explain too much beside it
+        found.append(
+            "the fit of the present model did not converge, so evidence and names are a list of what to check,"
+            " no finding"
+        )
     named = {addition.effect.name for addition in diagnosis.additions}
-    held = sorted(
-        {f"{f.effect} ({f.parameter.name} {f.value:g})" for f in diagnosis.completed.at_limits if f.effect in named}
-    )
-    if not held:
-        return None
-    return f"at the edge of what is possible, where something that the catalogue lacks may push it: {', '.join(held)}"
+    at_limits = {
+        f"{f.effect} ({f.parameter.name} {f.value:g})" for f in diagnosis.completed.at_limits if f.effect in named
+    }
+    if at_limits:  # the formula may be bent to what the catalogue lacks
+        found.append(
+            "at the edge of what is possible, where something that the catalogue lacks may push it:"
+            f" {', '.join(sorted(at_limits))}"
+        )
+    found += [text for text in (_imitation(diagnosis), _held(diagnosis)) if text is not None]
+    return "to be doubted: " + "; ".join(found) if found else None
 
 
 def _imitation(diagnosis: Diagnosis) -> str | None:
@@ -198,12 +184,6 @@ def why_probabilities(addition: Addition) -> str | None:
     )
 
 
-def size_of(found: Detectable, size: float) -> str:
-    """A size of an effect with its unit, as text."""
-    unit = found.parameter.unit
-    return f"{found.effect.name} {size:.2g}" + ("" if unit == "1" else f" {unit}")
-
-
 def pressure_error(found: Detectable, before: Sequence[Posterior], config: Config) -> tuple[float, float]:
     """Return relative error and reported relative std of the bearing pressure under an effect that stays unseen.
 
@@ -217,22 +197,29 @@ def pressure_error(found: Detectable, before: Sequence[Posterior], config: Confi
     return max(errors, key=lambda error: abs(error[0]) / max(error[1], 1e-12))
 
 
-def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
-    """What these recordings could have shown, what not, and what that may do to the bearing pressure."""
-    shown = [found for found in diagnosis.detectable if found.size is not None]
-    if shown:
-        sizes = ", ".join(size_of(found, found.size) for found in shown if found.size is not None)
-        yield f"these recordings could have shown, from about these sizes on: {sizes}"
-    if hidden := [found.effect.name for found in diagnosis.detectable if found.size is None]:
-        yield f"they could not have shown, at any usual size: {', '.join(hidden)}"
+def unseen_errors(diagnosis: Diagnosis, config: Config) -> list[tuple[Detectable, float, float]]:
+    """Return each effect that may be there unseen and moves the bearing pressure by more than its std, with both."""
     before = [diagnosis.soil_before(i) for i in range(len(diagnosis.base.fits))]
     errors = [(found, *pressure_error(found, before, config)) for found in diagnosis.detectable]
-    unseen = sorted((e for e in errors if abs(e[1]) > e[2]), key=lambda e: -abs(e[1]))
-    if unseen:
-        parts = [f"{size_of(found, found.unseen)} by {100.0 * error:+.1f} %" for found, error, _ in unseen[:MAX_UNSEEN]]
+    return [(found, error, std) for found, error, std in errors if abs(error) > std]
+
+
+def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
+    """What these recordings could have shown, what not, and what that may do to the bearing pressure."""
+
+    def text_of(found: Detectable, size: float) -> str:
+        unit = found.parameter.unit
+        return f"{found.effect.name} {size:.2g}" + ("" if unit == "1" else f" {unit}")
+
+    if sizes := [text_of(found, found.size) for found in diagnosis.detectable if found.size is not None]:
+        yield f"these recordings could have shown, from about these sizes on: {', '.join(sizes)}"
+    if hidden := [found.effect.name for found in diagnosis.detectable if found.size is None]:
+        yield f"they could not have shown, at any usual size: {', '.join(hidden)}"
+    if unseen := sorted(unseen_errors(diagnosis, config), key=lambda e: -abs(e[1])):
+        parts = [f"{text_of(found, found.unseen)} by {100.0 * error:+.1f} %" for found, error, _ in unseen[:MAX_UNSEEN]]
         more = f" (and {len(unseen) - MAX_UNSEEN} more by less)" if len(unseen) > MAX_UNSEEN else ""
-        seen = {found.size is not None for found, _, _ in unseen}
-        what = [text for is_seen, text in ((True, "sizes just below these"), (False, UNSEEN)) if is_seen in seen]
+        what = ["sizes just below these"] * any(found.size is not None for found, _, _ in unseen)
+        what += ["what they could not have shown"] * any(found.size is None for found, _, _ in unseen)
         yield (
             f"{' and '.join(what)} may move the bearing pressure by more than its "
             f"+- {100.0 * unseen[0][2]:.1f} %: {', '.join(parts)}{more}"

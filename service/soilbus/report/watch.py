@@ -1,8 +1,6 @@
 """`soilbus watch`: the dashboard on a terminal, of a live bus or of a recording of our frames.
 
-source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second; keys change the page
-                                                   -> lines, for a screen reader and where there is no terminal
-                                                   -> JSON, a line a window, for programs that send it on
+source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second; or lines; or JSON, a line a window
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import IO, Protocol
 
@@ -48,10 +46,9 @@ PAGES = {"driver": driver_page, "engineer": engineer_page}
 
 
 class Source(Protocol):
-    """Source of frames: a bus or a recording."""
+    """Bus or recording that frames come from; `fault` says why there are none."""
 
     fault: str
-    """Why there are none; empty where it works."""
 
     def receive(self, timeout: float, /) -> Received | can.Message | None:
         """Return the next frame, or None after at most `timeout` [s]."""
@@ -69,40 +66,32 @@ def watch(
     """Show the dashboard of the configured bus, or of a recording of our frames in its own time, until interrupted.
 
     A bus that goes away is waited for; a recording ends the command. With `names_wheels` the configuration is that of
-    the vehicle that is watched. After `seconds` it stops. `plain` gives lines even on a terminal, `as_json` a line of
-    JSON for each window.
-
-    Raises
-    ------
-    BusError
-        The bus cannot be opened at the start.
-    LogError
-        The recording cannot be read, or has no frame of ours.
+    the vehicle that is watched. `plain` gives lines even on a terminal, `as_json` a line of JSON for each window.
+    BusError where the bus cannot be opened at the start, LogError where a recording has no frame of ours.
     """
-    database, vehicle = output_database(config), Vehicle.of(config, names_wheels)
-    settings, filters = config.bus.model_dump(), filters_of(database)
-    until = math.inf if seconds is None else time.monotonic() + seconds
+    database, until = output_database(config), math.inf if seconds is None else time.monotonic() + seconds
+    filters = filters_of(database)
+    source: PlayedBus | LiveBus
+    if log is not None:
+        clock = PlayedClock(speed)
+        received, source = ReceivedFrames(database, clock), PlayedBus(read_frames(log), filters, clock)
+        if source.is_empty:
+            raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
+    else:
+        settings = config.bus.model_dump()
+        received = ReceivedFrames(database)
+        source = LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)
+        source.open()
 
-    def show_from(source: PlayedBus | LiveBus, received: ReceivedFrames) -> None:
-        def done() -> bool:
-            return time.monotonic() >= until or (isinstance(source, PlayedBus) and source.is_empty)
+    def done() -> bool:
+        return time.monotonic() >= until or (isinstance(source, PlayedBus) and source.is_empty)
 
-        dashboard = Dashboard(received, vehicle)
+    dashboard = Dashboard(received, Vehicle.of(config, names_wheels))
+    with closing(source) if isinstance(source, LiveBus) else nullcontext():
         if as_json:
             print_results(dashboard, source, sys.stdout, done)
         else:
             show(dashboard, source, Console(), plain, done, stays=log is not None and seconds is None)
-
-    if log is not None:
-        clock = PlayedClock(speed)
-        played = PlayedBus(read_frames(log), filters, clock)
-        if played.is_empty:
-            raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
-        show_from(played, ReceivedFrames(database, clock))
-        return
-    with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
-        bus.open()
-        show_from(bus, ReceivedFrames(database))
 
 
 def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
@@ -133,13 +122,13 @@ def show(
     name = "driver"
     with pressed_keys() as keys, Live(console=console, auto_refresh=False, screen=True) as live:
         redraw = clock()
-        while not (is_over := done()) or (stays and keys is not no_key):
+        while not (is_over := done()) or (stays and keys):
             if is_over:
                 dashboard.is_over = True
                 time.sleep(REDRAW_PERIOD)
             else:
                 _take(dashboard, source, redraw - clock())
-            key = keys()
+            key = keys() if keys else ""
             if key == "q":
                 return
             chosen = {"d": "driver", "e": "engineer", "\t": "engineer" if name == "driver" else "driver"}.get(key, name)
@@ -168,12 +157,7 @@ def _show_lines(
             console.file.flush()
 
 
-def print_results(
-    dashboard: Dashboard,
-    source: Source,
-    out: IO[str],
-    done: Callable[[], bool] = lambda: False,
-) -> None:
+def print_results(dashboard: Dashboard, source: Source, out: IO[str], done: Callable[[], bool]) -> None:
     """Print a line of JSON for each received window, and for each change of state in between; each is flushed.
 
     A window's line waits for the verdict that rests on it, at most a cycle of the fast frames.
@@ -205,14 +189,9 @@ def _take(dashboard: Dashboard, source: Source, timeout: float) -> Received | ca
     return message
 
 
-def no_key() -> str:
-    """Return no key, where none can be pressed."""
-    return ""
-
-
 @contextmanager
-def pressed_keys() -> Iterator[Callable[[], str]]:
-    """Give a function that returns the next key pressed, or "" at once.
+def pressed_keys() -> Iterator[Callable[[], str] | None]:
+    """Give a function that returns the next key pressed, or "" at once; None where there is no keyboard of ours.
 
     Keys come one by one and are not echoed until the end; Ctrl-C stays what it is.
     """
@@ -222,7 +201,7 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
     except (AttributeError, OSError, ValueError):
         is_ours = False
     if not is_ours:
-        yield no_key
+        yield None
         return
 
     def key() -> str:

@@ -1,7 +1,7 @@
 """Windows of a replay as a short summary.
 
-It counts windows by status and reason, with advice for each reason, then gives medians of the bearing
-pressure, decisions, failed solves, and samples used and refused.
+It counts windows by status and reason, each with advice in one line: why there is no valid estimate, what to do, and
+how much draft and slip varied within a window; then medians, decisions, failed solves, and samples used and refused.
 """
 
 from __future__ import annotations
@@ -16,9 +16,20 @@ from soilbus.decision.traversability import State, Status
 from soilbus.grouping import grouped
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
-from soilbus.report.advice import advice, of_use
 from soilbus.report.configuration import no_slope
 from soilbus.words import text_of
+
+DIAGNOSE = "record it and run soilbus diagnose"
+ADVICE = {
+    "not_excited new_soil": "the ground had just changed: nothing to do but drive on",
+    "not_excited few_bins": "too few values in a window: set a shorter estimator.bin or a longer estimator.window",
+    "standstill": "the vehicle stood or crept, or slipped beyond traversability.max_slip: drive on, with less pull",
+    "turning": "the vehicle turned, so its wheels have no common ground speed: drive straight",
+    "input_stale": "{} had pauses: check the sender and the wiring, or set a timeout that fits its rate",
+    "input_rejected": "{}: the counters do not go on by one: look for a second sender, or for lost frames",
+    "implausible": "{} contradicts the other sensors: check mounting, sign, scale and wiring",
+}
+"""What to do by reason, or by the first word of it, with the channels that it names."""
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
@@ -57,13 +68,14 @@ def summary_of(
         ]
     for (status, reason), group in by_reason(results):
         lines.append(f"  {len(group):5d} {status}" + ("" if reason == "none" else f": {reason}"))
-        what = advice(group, good)
-        lines += [] if what is None else [f"        {what}"]
+        if what := advice(group, good):
+            lines.append(f"        {what}")
     if good:
         bearing = np.median([r.bearing.value for r in good if r.bearing])
         std = np.median([r.bearing.std for r in good if r.bearing])
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
-    lines += [line for line in [machine_line(good)] if line]
+    if machine := machine_line(good):
+        lines.append(machine)
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
     could_pull = [r for r in good if r.traversability.max_draft is not None]
@@ -99,10 +111,9 @@ def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
     if not results:
         return f"no window could be made: no recording lasts the {window:g} s of a window"
     (status, reason), group = by_reason(results)[0]
+    line = f"no window could be used: {len(group)} of {len(results)} are {status}: {reason}"
     what = advice(group, [])
-    return f"no window could be used: {len(group)} of {len(results)} are {status}: {reason}" + (
-        "" if what is None else f" ({what})"
-    )
+    return f"{line} ({what})" if what else line
 
 
 def by_reason(results: Sequence[WindowResult]) -> list[tuple[tuple[str, str], list[WindowResult]]]:
@@ -114,3 +125,73 @@ def by_reason(results: Sequence[WindowResult]) -> list[tuple[tuple[str, str], li
 def counted(counts: Counter[str]) -> str:
     """Return counts as in "outlier 3, stale 1", the most frequent first; "none" without any."""
     return ", ".join(f"{name} {n}" for name, n in counts.most_common()) or "none"
+
+
+def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str:
+    """Return one line on windows of one status and reason beside the valid ones of the run; "" without advice."""
+    reason = windows[0].reason
+    kind, *names = reason.split()
+    if said := ADVICE.get(reason) or ADVICE.get(kind):
+        return said.format(", ".join(name for name in names if not name.startswith("(")))
+    if kind == "input_missing":
+        silent = ", ".join(name for name in names if name != "wheels")
+        parts = (
+            [f"no usable value of {silent} ever came: check the mapping, and that this bus carries it"]
+            if silent
+            else []
+        )
+        if "wheels" in names:
+            parts.append("no wheel that drives has a torque and a speed mapped, its own or its axle's")
+        return "; ".join(parts)
+    if kind == "not_excited":
+        here, there = _draft(windows), _draft(valid)
+        if here is None or there is None:
+            return f"vary the load more: {_moved(windows)}"
+        if here[1] < there[1]:
+            return f"vary the load: {_moved(windows, ' only')}; in the valid windows {_moved(valid)}"
+        return f"vary the load for longer on one ground: {_moved(windows)}, as much as in the valid windows"
+    if kind == "no_convergence":
+        return f"no soil explains these data ({_moved(windows)}): check signs and scales; else {DIAGNOSE}"
+    if kind != "model_mismatch":
+        return ""
+    said = f"check mass, radii, gear ratios, signs, slope and [noise]; else {DIAGNOSE}"
+    if what := ", ".join(names):
+        said = f"{what} is mapped for several wheels: if it is the cell of one, map it for that one alone; or {said}"
+    channels = sorted({name for w in windows for name in w.prediction_error})
+    shares = {c: float(np.median([w.prediction_error.get(c, 0.0) for w in windows])) for c in channels}
+    worst = max(shares, key=shares.__getitem__, default=None)
+    return said if worst is None else f"the model predicts {worst} {100.0 * shares[worst]:.0f} % off: {said}"
+
+
+def _moved(windows: Sequence[WindowResult], only: str = "") -> str:
+    """How much draft and slip vary within a window (standard deviations), as medians of the windows."""
+    draft, slip = _draft(windows), _typical([(w.excitation.slip, w.excitation.slip_sd) for w in windows])
+    said = []
+    if draft is not None:
+        mean, sd = draft
+        newtons = f"{mean:.0f} ± {sd:.0f} N"
+        moved = f"moved by {100.0 * sd / abs(mean):.2g} %{only} ({newtons})" if abs(mean) > sd else f"was {newtons}"
+        said.append(f"the draft {moved}")
+    if slip is not None:
+        said.append("slip was {:.1f} ± {:.1f} %".format(*(100.0 * of for of in slip)))
+    return ", ".join(said) or "draft and slip are not known"
+
+
+def _draft(windows: Sequence[WindowResult]) -> tuple[float, float] | None:
+    """Of what is towed; None where nothing ever is."""
+    drafts = [(w.excitation.draft, w.excitation.draft_sd) for w in windows]
+    return None if all(draft == (0.0, 0.0) for draft in drafts) else _typical(drafts)
+
+
+def _typical(of: Sequence[tuple[float | None, float | None]]) -> tuple[float, float] | None:
+    """Medians of known means and standard deviations."""
+    known = [(mean, sd) for mean, sd in of if mean is not None and sd is not None]
+    if not known:
+        return None
+    mean, sd = np.median(known, axis=0).tolist()
+    return mean, sd
+
+
+def of_use(windows: Sequence[WindowResult]) -> list[WindowResult]:
+    """Return the windows with an estimate of the soil, of any status."""
+    return [window for window in windows if window.status is not Status.INVALID and window.posterior is not None]

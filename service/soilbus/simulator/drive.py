@@ -45,6 +45,7 @@ from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, Wave, oscil
 from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.vehicle import GRAVITY, Chassis, pull_required, wheel_loads
 from soilbus.terra.wheel import WheelModel
+from soilbus.words import WorkError
 
 STEP = 0.1
 """Length [s] of a step where the drive depends on what happened before."""
@@ -61,7 +62,7 @@ _LARGEST_LOSS = 0.9
 """Share of its load that a bouncing wheel loses at most: quasi-static wheels do not jump."""
 
 
-class SimulationError(Exception):
+class SimulationError(WorkError):
     """Error of a scenario that cannot be driven with this configuration; one line says why."""
 
 

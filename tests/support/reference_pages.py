@@ -3,7 +3,7 @@
 Each page is a pure function of what it describes (the model of the configuration, the parser of the command line, the
 catalogue of effects), and a test compares the pages in `service/docs` with it.
 
-    python -m soilbus.cli.reference service/docs     writes them again
+    python tests/support/reference_pages.py service/docs     writes them again
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from soilbus.cli.arguments import EXAMPLES, command_line, subcommands
-from soilbus.cli.effects import HEAD, parameter_rows
+from soilbus.cli.arguments import command_line, subcommands
+from soilbus.cli.effects import parameter_rows
 from soilbus.config import model
 from soilbus.config.model import Column, Config, Noise, Prior, RunningGear, Signal
 from soilbus.config.model import Effect as EffectTable
@@ -30,7 +30,7 @@ from soilbus.terra.effects.effect import Effect
 
 VALUES = (Signal, Noise, Prior, Column, EffectTable)
 """Sections that are values of many keys."""
-GENERATED = "<!-- generated: python -m soilbus.cli.reference service/docs -->\n\n"
+GENERATED = "<!-- generated: python tests/support/reference_pages.py service/docs -->\n\n"
 
 
 def pages() -> dict[str, str]:
@@ -153,7 +153,7 @@ def commands_page() -> str:
     )
     for name, command in subcommands(command_line()).items():
         text += f"\n## soilbus {name}\n\n{command.description}\n\n{_arguments(command)}"
-        text += f"\n```sh\n{EXAMPLES[name]}\n```\n"
+        text += f"\n```sh\n{(command.epilog or '').splitlines()[-1].strip()}\n```\n"
     return text
 
 
@@ -185,10 +185,11 @@ def _effect(effect: Effect) -> str:
     alike: dict[tuple[str, ...], list[str]] = {}  # of a spline, say: one row for all its knots
     for name, *others in parameter_rows(effect):
         alike.setdefault((name.rstrip("0123456789"), *others), []).append(f"`{name}`")
+    head = ("parameter", "unit", "absent at", "prior std", "range")
     rows = ([", ".join(names), *others] for (_, *others), names in alike.items())
     return (
         f"\n## {effect.name}\n\n{effect.physics}\n\n*Shown by:* {effect.tells}\n\n*Source:* {effect.source}\n\n"
-        + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["-"] * len(HEAD), *rows))
+        + "".join(f"| {' | '.join(row)} |\n" for row in (head, ["-"] * len(head), *rows))
     )
 
 
