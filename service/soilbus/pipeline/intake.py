@@ -237,7 +237,7 @@ class Intake:
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
         self._of_position = {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}
-        self._positions = PositionTrack(self._of_position, options.fix_smoothing)
+        self._positions = PositionTrack(self._of_position, options.timeout)
         self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
         of_effects = delays_of(config) if delays is None else delays
         late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
@@ -381,9 +381,10 @@ class Intake:
         missing = [c.name for c in self.needed if c.name not in self.last_seen]
         missing += ["ground_speed"] if self.config.signals.ground_speed is None else []
         missing += [] if self.rig.wheels else ["wheels"]
-        covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
+        longest = self._options.timeout
+        silent = dict(zip(self.rig.channels, silences(raw, longest / 2.0), strict=True))
         stale = self.stale(end)
-        poor = [c.name for c in self.needed if c.name in stale or covered[c.name] < self._options.min_coverage]
+        poor = [c.name for c in self.needed if c.name in stale or silent[c.name] >= longest]
         task = WindowTask(
             index=self.ended,
             start=start,
@@ -473,13 +474,12 @@ def column_means(rows: Array) -> list[float | None]:
     return [float(s / n) if n else None for s, n in zip(total, count, strict=True)]
 
 
-def coverage(window: Window, span: float) -> Array:
-    """Return the share of a window's blocks of `span` [s] with a sample, by channel of the rig."""
-    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
-    known = np.isfinite(np.column_stack([getattr(window, q) for q in quantities]))
+def silences(window: Window, block: float) -> list[float]:
+    """Return the time [s] of a window's blocks of this length [s] without a sample, by channel of the rig."""
+    known = np.isfinite(np.column_stack([getattr(window, q) for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)]))
     if len(known) < 2:
-        return np.zeros(known.shape[1])
-    block = ((window.t - window.t[0]) / span + 1e-6).astype(int)
-    begins = [0, *(np.flatnonzero(block[1:] != block[:-1]) + 1)]
-    share: Array = np.logical_or.reduceat(known, begins).sum(0) / (block[-1] + 1)
-    return share
+        return [math.inf] * known.shape[1]
+    number = ((window.t - window.t[0]) / block + 1e-6).astype(int)
+    heard = np.logical_or.reduceat(known, np.flatnonzero(np.diff(number, prepend=-1)))
+    silent: list[float] = (block * (number[-1] + 1 - heard.sum(axis=0))).tolist()
+    return silent

@@ -38,7 +38,7 @@ class PositionTrack:
         Time [s] before and after, within which fixes are averaged.
     """
 
-    def __init__(self, timeout: Mapping[str, float], smoothing: float = RECEPTION.fix_smoothing) -> None:
+    def __init__(self, timeout: Mapping[str, float], smoothing: float = RECEPTION.timeout) -> None:
         self._timeout, self._smoothing = dict(timeout), smoothing
         self.forget()
 

@@ -391,7 +391,7 @@ def _contradictions(facts: Facts, channels: Iterable[Channel], database: Databas
     for begin in begins:
         rows = np.arange(begin, min(begin + n, len(facts.window.t)))
         motor = np.where(mapped, np.abs(facts.motor[rows]), np.nan)
-        named.update(implausible(facts.window.rows(rows), rig, s.min_speed, s.max_turn, s.bin, resolution, motor))
+        named.update(implausible(facts.window.rows(rows), rig, s, resolution, motor))
     for name, count in named.items():
         if count > max(LIMITS.windows * len(begins), 1.0):
             text = f"{key.get(name, name)}: contradicts the other sensors in {count} of {len(begins)} windows"
