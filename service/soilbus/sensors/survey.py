@@ -302,7 +302,7 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         jumps = np.abs(np.diff(value))
         typical = float(np.median(jumps))
         alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
-        if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
+        if typical > LIMITS.jump_sd * sd and alike > 0.5:
             yield Finding(
                 f"{s.channel.key}: jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times"
                 f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.path}"
@@ -341,7 +341,7 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
         return
     slow, fast = (by(wheels, key=lambda s: s.rate) for by in (min, max))
     present, length = config.estimator.bin, min(max(1.0 / fast.rate, SHORT_BIN), 0.5 / slow.rate)
-    if slow.rate * present < LIMITS.instant and fast.rate * present >= LIMITS.mean_of and length < present:
+    if slow.rate * present < LIMITS.instant and fast.rate * present >= 2.0 * LIMITS.instant and length < present:
         yield Finding(
             f"{slow.channel.key}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {fast.channel.key}: in"
             f" bins of {present:g} s a mean stands beside a value of one instant, and loads that shake bias the soil;"
