@@ -52,10 +52,9 @@ class Resolution(NamedTuple):
 class ConsistencyInput(NamedTuple):
     """Window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
 
-    window has values of every wheel (`instrumentation.completed`), raw the channels alone.
-
-    traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
-    does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
+    window has values of every wheel (`instrumentation.completed`), raw the channels alone.  traction is torque over
+    load and radius; slip is nan unless the vehicle drives straight on.  motor_speed [rad/s] (N, W) is at the wheel's
+    side of the gear.
     """
 
     window: Window
@@ -125,7 +124,7 @@ class SensorConsistency:
 
 
 def resolution_of(channel: Channel, database: Database) -> Resolution:
-    """Return the step of a channel's signal in SI, and whether zero is the end of its range."""
+    """Return the resolution of a channel by its signal; zero is what rests where its range ends there."""
     signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
     step = 0.0 if signal.conversion.is_float else abs(channel.factor * float(signal.scale))
     ends = (signal.minimum, signal.maximum)
@@ -360,7 +359,8 @@ def scale_of_acceleration(data: ConsistencyInput) -> Iterator[str]:
     false.
     """
     window, lag, n = data.window, data.sustained, data.compared
-    gained = np.where(data.driving[lag:], change(smooth(window.ground_speed), lag), np.nan)
+    smooth = neighbours(np.pad(window.ground_speed, 1, "edge"), 3).mean(axis=-1)
+    gained = np.where(data.driving[lag:], change(smooth, lag), np.nan)
     is_known = np.isfinite(window.pitch) | (not data.rig.specific_force)
     reported = data.bin * moving_sum(np.where(is_known, window.acceleration, np.nan), lag)
     if len(reported) < n:
@@ -434,14 +434,9 @@ def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     with np.errstate(invalid="ignore"):
         stands_out = np.abs(driven) > options.significant_sd * np.sqrt(change_variance(of_thrust, lag))
         stands_out &= np.abs(pull) > options.significant_sd * np.sqrt(change_variance(of_pull, lag))
-    opposite = running_sum((driven * pull)[stands_out] < 0.0, data.compared)
+    opposite = neighbours((driven * pull)[stands_out] < 0.0, data.compared).sum(axis=-1)
     if median(pulled * thrust) < 0.0 and (opposite >= options.usual_share * data.compared).any():
         yield "draft"
-
-
-def running_sum(values: NDArray[Any], n: int) -> Array:
-    """Return the sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
-    return np.convolve(values, np.ones(n), "valid") if len(values) >= n else np.zeros(0)
 
 
 def change(values: Array, lag: int) -> Array:
@@ -454,19 +449,13 @@ def change_variance(variance: Array, lag: int) -> Array:
     return variance[lag:] + variance[:-lag]
 
 
-def smooth(values: Array) -> Array:
-    """Return the means (N,) of each three neighbours."""
-    wide = np.concatenate([values[:1], values, values[-1:]])
-    return np.asarray((wide[:-2] + wide[1:-1] + wide[2:]) / 3.0)
-
-
 def moving_sum(values: Array, lag: int) -> Array:
     """Return the sums (N - lag,) from each bin's middle to that of the one `lag` later."""
-    return running_sum((values[1:] + values[:-1]) / 2.0, lag)
+    return np.asarray(neighbours((values[1:] + values[:-1]) / 2.0, lag).sum(axis=-1))
 
 
-def neighbours(values: Array, n: int) -> Array:
-    """Return each n neighbours of (..., N), (..., N - n + 1, n).
+def neighbours(values: NDArray[Any], n: int) -> Array:
+    """Return each n neighbours of (..., N), (..., N - n + 1, n); none where there are fewer.
 
     Not numpy's view of them: each call leaves a used place in Python's table of strings, which after hours doubles.
     """
@@ -481,9 +470,7 @@ def median(values: Array) -> float:
 
 def lasts(holds: Mask, bins: int) -> bool:
     """Return whether something holds in this number of bins in a row."""
-    if np.count_nonzero(holds) < bins:
-        return False
-    return any(last - first >= bins for first, last in runs(holds))
+    return bool(neighbours(holds, bins).all(axis=-1).any())
 
 
 def runs(holds: Mask) -> list[tuple[int, int]]:
