@@ -57,25 +57,20 @@ class WindowTask:
 
     Attributes
     ----------
-    index, epoch
-        Number of the window since the start, and number of restarts of the clock.
-    start, end
-        [s].
-    window, slip
-        The forward data, and mean slip by wheel (None where not known).
+    index, epoch, fresh
+        Number of the window since the start, number of restarts of the clock, and whether nothing may be carried over
+        from the window before.
+    start, end, late
+        [s], and the delay [s] of the latest channel, for which all others wait.
+    window, slip, track
+        The forward data, mean slip by wheel (None where not known), positions from the window's middle on.
     missing, poor, implausible, untrusted
-        Needed channels never received; needed channels that are stale at the end or cover the window badly; channels
-        that contradict the others and were removed from the window; channels of a message with a second sender.
+        Needed channels never received; needed channels that are stale at the end or silent too long; channels that
+        contradict the others and were removed from the window; channels of a message with a second sender.
     torque_limit
         (W,) [N m], nan where not known.
-    track
-        Positions from the window's middle on.
     rejected
         Refused samples by reason.
-    fresh
-        Nothing may be carried over from the window before.
-    late
-        [s], delay of the latest channel, for which all others wait.
     """
 
     index: int
@@ -150,17 +145,9 @@ class Refusals:
 class ReportedLimits:
     """Torque limit [N m] of each motor (W,): as reported, else as configured, else nan.
 
-    A reported limit holds until another one is reported, also through silence and a set clock.  It is the median of the
-    last samples.
-
-    A motor of several wheels gives each the share that `Motor.share` says; a wheel that is not driven has the limit 0.
-
-    Parameters
-    ----------
-    motors
-        Of the vehicle; a wheel's limit is that of the last motor with one that drives it.
-    samples
-        Number of the last samples.
+    The median of the last samples holds until another one is reported, also through silence and a set clock.  A motor
+    of several wheels gives each the share that `Motor.share` says; a wheel that is not driven has the limit 0, one of
+    several motors that of the last with a limit.
     """
 
     def __init__(self, motors: Motors, samples: int = RECEPTION.limit_samples) -> None:
@@ -200,26 +187,11 @@ class ReportedLimits:
 
 
 class Intake:
-    """Decoding, bins and freshness of one vehicle's channels.
+    """Decoding, bins and freshness of one vehicle's channels; ConfigError where configuration and database do not fit.
 
-    Parameters
-    ----------
-    config, database
-        The configuration and the messages of the vehicle's bus.
-    delays
-        [s] by quantity, added to each channel's `delay`; None takes those of the configured effects.
-    options
-        Which samples and which windows are used.
-
-    Raises
-    ------
-    ConfigError
-        Where configuration and database do not fit.
-
-    Notes
-    -----
-    Channels are aligned by delaying all others to the latest one.  So a window is complete, and its data are older than
-    its end by that delay.  Freshness goes by the stamps of the frames.
+    Channels are aligned by delaying all others to the latest one, by their `delay` and `delays` [s] by quantity (None:
+    those of the configured effects).  So a window is complete, and its data are older than its end by that delay.
+    Freshness goes by the stamps of the frames.
     """
 
     def __init__(
