@@ -14,7 +14,7 @@ the mirrored vehicle.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -38,7 +38,10 @@ def _weight(facts: Facts) -> Iterator[Finding]:
         raise UndecidableError("not every wheel load is known: the loads cannot be compared with the mass")
     off = abs(measured / weight - 1.0)
     if off > LIMITS.weight / 2.0:
-        why = _known_factor(measured / weight, 0.04) or "which of them is wrong? (ballast, unit or scale of the loads)"
+        why = (
+            _likely(FACTORS, measured / weight, 0.96, 1.04)
+            or "which of them is wrong? (ballast, unit or scale of the loads)"
+        )
         text = (
             f"the wheel loads sum to {measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg, but"
             f" vehicle.mass = {chassis.mass:g} kg: {why}"
@@ -73,7 +76,7 @@ def _one_axle(facts: Facts) -> Iterator[Finding]:
     if chassis is None or len(weighed) != 1 or facts.mapped & {*names} or set(rig.front.tolist()) != {True, False}:
         return
     has, due = (pair[weighed[0] == "rear"] for pair in _axle_loads(facts))
-    why = _known_factor(has / due, LIMITS.weight) if _log_off(has / due) > 1.0 else ""  # a unit, not a measure
+    why = _likely(FACTORS, has / due, 1.0 - LIMITS.weight, 1.0 + LIMITS.weight) if _log_off(has / due) > 1.0 else ""
     if why:
         yield fault(
             f"axle.{weighed[0]}.load: {has / 1e3:.1f} kN, where mass, centre of gravity and draft give"
@@ -127,10 +130,19 @@ FACTORS = {
 """Likely mistakes by the multiple of what loads should be."""
 
 
-def _known_factor(ratio: float, within: float) -> str:
-    """The likely mistake if loads are this multiple of what they should be, to a share of it; "" if there is none."""
-    nearest = min(FACTORS, key=lambda factor: _log_off(ratio / factor))
-    return FACTORS[nearest] if _log_off(ratio / nearest) < within else ""
+FASTER = {
+    30.0 / math.pi: "are the wheel speeds in rpm where the DBC says rad/s, ",
+    3.6: "is the ground speed in m/s where the DBC says km/h, ",
+    2.0: "a diameter in the place of a radius, ",
+    1.0 / 3.6: "is the ground speed in km/h where the DBC says m/s, ",
+    math.pi / 30.0: "are the wheel speeds in rad/s where the DBC says rpm, ",
+}
+"""Likely mistakes by how many times as fast as the ground they make the rims."""
+
+
+def _likely(mistakes: Mapping[float, str], ratio: float, least: float, most: float) -> str:
+    """The mistake that makes this multiple, to such a factor; "" if there is none."""
+    return next((why for known, why in mistakes.items() if least < ratio / known < most), "")
 
 
 def _directions(facts: Facts) -> Iterator[Finding]:
@@ -250,9 +262,10 @@ def _slips(facts: Facts) -> Iterator[Finding]:
         factor = 1.0 / (1.0 - (middle if is_pushed else least))
         who = "driving wheels seem" if is_pushed else "the wheels seem"
         never = "" if is_pushed else f", never by less than {least:.2f}"
+        why = _likely(FASTER, factor, 0.95, 1.7)  # slip of up to 0.4 included
         yield fault(
             f"{who} to slip by {middle:.2f}{never}: their rims go {factor:.2f} times as fast as the ground:"
-            f" {_why_fast(factor)}{gear}radius, or unit, sign or byte order of ground and wheel speeds?",
+            f" {why}{gear}radius, or unit, sign or byte order of ground and wheel speeds?",
             "ground_speed",
             *speeds,
         )
@@ -269,21 +282,6 @@ def _slips(facts: Facts) -> Iterator[Finding]:
     for wheel, own in apart.items():
         text = f"seems to slip by {own:.2f}, most wheels by {middle:.2f}: its radius, {gear}speed signal or its unit?"
         yield fault(f"wheel.{wheel}: {text}", f"speed.{wheel}")
-
-
-FASTER = {
-    30.0 / math.pi: "are the wheel speeds in rpm where the DBC says rad/s, ",
-    3.6: "is the ground speed in m/s where the DBC says km/h, ",
-    2.0: "a diameter in the place of a radius, ",
-    1.0 / 3.6: "is the ground speed in km/h where the DBC says m/s, ",
-    math.pi / 30.0: "are the wheel speeds in rad/s where the DBC says rpm, ",
-}
-"""Likely mistakes by how many times as fast as the ground they make the rims."""
-
-
-def _why_fast(factor: float) -> str:
-    """The likely mistake if rims are this many times as fast as the ground (slip of up to 0.4 included)."""
-    return next((why for known, why in FASTER.items() if 0.95 < factor / known < 1.7), "")
 
 
 def _balance(facts: Facts) -> Iterator[Finding]:
