@@ -53,10 +53,9 @@ class ConsistencyOptions:
     leaves equal readings."""
     usual_share: float = 0.9
     """Share [1] that is nearly all: of changes that are known, and that go the wrong way.  One less it is hardly any:
-    of readings that repeat elsewhere, as those of a frozen sensor do not, and of the speed of a wheel that stands."""
+    of readings that repeat elsewhere, as those of a frozen sensor do not, of the speed of a wheel that stands, of the
+    traction of one that drives nothing."""
 
-    idle_traction: float = 0.01
-    """Traction [1] of a wheel that drives nothing: any soil resists more."""
     driving_traction: float = 0.15
     """Traction [1] of a wheel that surely drives."""
     gear_slack: float = 0.03
@@ -76,6 +75,11 @@ class ConsistencyOptions:
 
     scale_ratio: float = 1.35
     """Ratio [1] of the changes of speed and acceleration from which they contradict each other."""
+
+    @property
+    def idle_traction(self) -> float:
+        """Traction of a wheel that drives nothing: any soil resists more."""
+        return (1.0 - self.usual_share) * self.driving_traction
 
     @property
     def scatter(self) -> float:
