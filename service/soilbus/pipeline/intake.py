@@ -210,7 +210,6 @@ class Intake:
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
         self._of_position = {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}
         self._positions = PositionTrack(self._of_position, options.timeout)
-        self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
         of_effects = delays_of(config) if delays is None else delays
         late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
         self._latest = max([0.0, *late.values()])
@@ -252,7 +251,7 @@ class Intake:
         self._bins = None
         self._fresh = True
         self._positions.forget()
-        self._consistency.forget()
+        self._consistency = SensorConsistency(self.rig, self.channels, self._database, self._settings)
         self._limits.forget_times()
         self._implausible: tuple[str, ...] = ()
         self.next_end = math.inf

@@ -85,12 +85,8 @@ class SensorConsistency:
     def __init__(self, rig: Rig, channels: Iterable[Channel], database: Database, settings: Estimator) -> None:
         self._rig, self._settings = rig, settings
         self._resolution = {c.name: resolution_of(c, database) for c in channels}
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget the speeds of the motors."""
-        names = [(wheel, f"motor_speed.{wheel}") for wheel in self._rig.wheels]
-        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel, n in names if n in self._resolution}
+        motors = [wheel for wheel in rig.wheels if f"motor_speed.{wheel}" in self._resolution]
+        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in motors}
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
         """Keep the motors' speeds among these samples (t [s], value in SI; both (N,)) by channel."""
@@ -396,7 +392,7 @@ def _scales(gained: Array, reported: Array, n: int, late: int, options: Consiste
     both, of_one, of_other, count = neighbours(np.stack([one * other, one**2, other**2, known]), n).sum(axis=-1)
     enough = (count >= options.usual_share * n) & (of_one > 0.0) & (of_other > 0.0)
     together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
-    fits = np.sqrt(1.0 - together**2) < options.scatter
+    fits = 1.0 - together**2 < options.scatter**2
     scale = np.divide(both, of_other, where=fits, out=np.full(both.shape, np.inf))
     best = np.argmin(np.abs(np.log(np.abs(scale))) + np.where(scale < 0.0, np.log(options.scale_ratio), 0.0), axis=0)
     chosen = np.take_along_axis(scale, best[None], axis=0)[0]
@@ -470,7 +466,7 @@ def median(values: Array) -> float:
 
 def lasts(holds: Mask, bins: int) -> bool:
     """Return whether something holds in this number of bins in a row."""
-    return bool(neighbours(holds, bins).all(axis=-1).any())
+    return bool(np.count_nonzero(holds) >= bins and neighbours(holds, bins).all(axis=-1).any())
 
 
 def runs(holds: Mask) -> list[tuple[int, int]]:

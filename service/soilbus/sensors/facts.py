@@ -148,9 +148,3 @@ def settled(rows: Array, block: int, least: int) -> Array | None:
     rows = rows[np.isfinite(rows).all(axis=1)]
     whole = len(rows) // block * block
     return np.asarray(rows[:whole].reshape(-1, block, rows.shape[1]).mean(axis=1)) if len(rows) >= least else None
-
-
-def spread(values: Array) -> float:
-    """Return the standard deviation of the known values; 0 of none."""
-    known = values[np.isfinite(values)]
-    return float(known.std()) if len(known) else 0.0

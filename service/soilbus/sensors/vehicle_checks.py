@@ -21,7 +21,7 @@ import numpy as np
 from soilbus.config.model import Axle, Wheel
 from soilbus.estimation.window import pairs, pull_given, zero_if_unknown
 from soilbus.sensors.consistency import change, median
-from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, changes, fault, regression, settled, spread
+from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, changes, fault, regression, settled
 from soilbus.sensors.options import CONSISTENCY
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 
@@ -338,8 +338,8 @@ def _balance(facts: Facts) -> Iterator[Finding]:
         yield fault(text, *torques, "draft")
     elif of_inertia < -LIMITS.side_sd * inertia_sd:
         lag = facts.bins(1.0)
-        slope = spread(change(window.pitch, lag)) * GRAVITY
-        name = "pitch" if slope > spread(change(window.acceleration, lag)) else "acceleration"
+        slope, inertia = (change(zero_if_unknown(a), lag).std() for a in (window.pitch, window.acceleration))
+        name = "pitch" if GRAVITY * slope > inertia else "acceleration"
         positive = "nose up" if name == "pitch" else "where the vehicle speeds up"
         yield fault(
             f"signals.{name}: asks for less thrust whenever the wheels give more: its sign (positive {positive};"
