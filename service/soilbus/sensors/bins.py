@@ -4,7 +4,7 @@
     variance = noise / (n w),  w = 1 / (1 + d^2 / 2)     n: samples, d: shift in bins, w: worth of a sample
 
 Sums and counts are kept by bin and channel.  Each sample is added once, however many windows contain it.  A bin without
-a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins (`_bridged`).
+a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins (`_bridge`).
 """
 
 from __future__ import annotations
@@ -122,9 +122,7 @@ class Bins:
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
         of_vehicle = slice(len(WHEEL_QUANTITIES) * self._noise.n_wheels, None)
         samples, count = int(count.sum()), count.copy()
-        bridged = _bridged(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
-        for table, columns in zip((mean, since, count), bridged, strict=True):
-            table[:, of_vehicle] = columns
+        _bridge(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
         mean, worth = _at_centres(mean, since, centre)
         return made_window(self._noise, self.origin + centre, mean, count * worth, samples)
 
@@ -138,8 +136,8 @@ def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Ar
         return np.asarray(np.bincount(place[inside], value[inside], minlength=n) / count)
 
 
-def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Array, Array, Array]:
-    """Mean, mean time [s] and count (N, channels) with the bins between samples of slower channels filled by lines.
+def _bridge(mean: Array, since: Array, count: Array, centre: Array) -> None:
+    """Fill the bins between samples of slower channels by lines: mean, mean time [s], count (N, channels), in place.
 
     The samples are shared among the bins: n samples are worth no more than n.  For channels of the vehicle only, whose
     mass lets them change slowly: what a wheel does swings with its load at 1.5 to 3 Hz.  One lost sample doubles the
@@ -147,11 +145,7 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     """
     filled = count > 0.0
     n_filled = filled.sum(0)
-    slow = np.flatnonzero((n_filled > 2) & (n_filled < len(filled)))
-    if not len(slow):
-        return mean, since, count
-    mean, since, per_bin = mean.copy(), since.copy(), count.copy()
-    for channel in slow:
+    for channel in np.flatnonzero((n_filled > 2) & (n_filled < len(filled))):
         at = np.flatnonzero(filled[:, channel])
         step = np.diff(at)
         usual = np.median(step)
@@ -161,8 +155,7 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
         between = np.concatenate([np.arange(i + 1, i + n) for i, n in zip(at, step, strict=False)])
         mean[between, channel] = np.interp(centre[between], since[at, channel], mean[at, channel])
         since[between, channel] = centre[between]
-        per_bin[np.concatenate([at, between]), channel] = count[:, channel].sum() / (len(at) + len(between))
-    return mean, since, per_bin
+        count[np.concatenate([at, between]), channel] = count[:, channel].sum() / (len(at) + len(between))
 
 
 def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:

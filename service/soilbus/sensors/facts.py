@@ -59,8 +59,10 @@ class Limits:
     noise (`noise.pitch`)."""
     side_sd: float = 4.0
     """Standard deviations by which a regression coefficient must have the wrong sign, or lie outside `scale`."""
+    jump: float = 0.3
+    """Median change from value to value, as a share of the median value; a vehicle's inertia keeps it lower."""
     jump_sd: float = 10.0
-    """Median change from value to value, in sd of the configured noise, that no vehicle's inertia allows."""
+    """The same, in standard deviations of the configured noise."""
     windows: float = 0.2
     """Share of windows in which a sensor contradicts the others."""
 

@@ -275,7 +275,7 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         jumps = np.diff(value)
         typical = float(np.median(np.abs(jumps)))
         alike = float((jumps**2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
-        if typical > LIMITS.jump_sd * sd and alike > 0.5:
+        if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
             text = (
                 f"jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times its noise: is"
                 f" the byte order (Intel, Motorola) or the start bit of {s.channel.path} right in the DBC?"

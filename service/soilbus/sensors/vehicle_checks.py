@@ -36,7 +36,7 @@ def _weight(facts: Facts) -> Iterator[Finding]:
     weight, measured = chassis.mass * GRAVITY, median(window.load.sum(axis=1) / np.cos(zero_if_unknown(window.pitch)))
     if not math.isfinite(measured):
         raise UndecidableError("not every wheel load is known: the loads cannot be compared with the mass")
-    off = abs(measured / weight - 1.0)
+    off, names = abs(measured / weight - 1.0), [f"load.{w}" for w in rig.wheels]
     if off > LIMITS.weight / 2.0:
         why = (
             _likely(FACTORS, measured / weight, 0.96, 1.04)
@@ -46,17 +46,18 @@ def _weight(facts: Facts) -> Iterator[Finding]:
             f"the wheel loads sum to {measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg, but"
             f" vehicle.mass = {chassis.mass:g} kg: {why}"
         )
-        yield fault(text, *(f"load.{w}" for w in rig.wheels)) if off > LIMITS.weight else Finding(text, False)
+        yield fault(text, *names) if off > LIMITS.weight else Finding(text, False)
         return
     has, due = _axle_loads(facts)
     if set(rig.front.tolist()) == {True, False} and abs(has[0] - due[0]) > LIMITS.weight * weight:
         between = "axles between them count on both by their place; " if len(rig.axles) > 2 else ""
-        yield Finding(
+        text = (
             f"the front wheels carry {has[0] / 1e3:.1f} kN and the rear wheels {has[1] / 1e3:.1f} kN, where mass,"
             f" centre of gravity and draft give {due[0] / 1e3:.1f} and {due[1] / 1e3:.1f} kN: {between}"
-            "cg_ahead_of_rear_axle, loads of swapped wheels, or a draft of the wrong sign or size?",
-            False,
+            "cg_ahead_of_rear_axle, loads of swapped wheels, or a draft of the wrong sign or size?"
         )
+        is_swapped = abs(has[0] - due[1]) < LIMITS.weight * weight
+        yield fault(text, *names) if is_swapped else Finding(text, False)
 
 
 def _axle_loads(facts: Facts) -> tuple[list[float], list[float]]:
@@ -211,7 +212,8 @@ def _of_gear(facts: Facts, key: str, of: Wheel | Axle, ratio: float, wheels: lis
     yield fault(
         f"{key}.gear_ratio = {of.gear_ratio:g}, but {of.motor_speed.signal} turns {of.gear_ratio * ratio:.4g} times as"
         f" fast as {what}: gear ratio,{radius} or unit or byte order of one of the speeds?",
-        *(f"{quantity}.{of.name}" for quantity in ("torque", "motor_speed", "speed")),
+        f"torque.{of.name}",
+        f"{'motor_speed' if isinstance(of, Wheel) else 'speed'}.{of.name}",
     )
 
 
