@@ -162,18 +162,18 @@ MUTATIONS = (
     ),
     Mutation(
         "one repeated reading makes a sensor coarse", "sensors/consistency.py",
-        "> options.repeated_share * (np", "> 0.0 * (np",
+        "> rare * (np", "> 0.0 * (np",
         ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
     ),
     Mutation(
         "no sensor is coarse", "sensors/consistency.py",
-        "> options.repeated_share * (np", "> 1.0 * (np",
+        "> rare * (np", "> 1.0 * (np",
         ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
     ),
     Mutation(
         "readings that repeat for long count as repeated elsewhere", "sensors/consistency.py",
-        "same[:, i].sum() - within > options.repeated_share * (np.isfinite(value[:, i]).sum() - within)",
-        "same[:, i].sum() > options.repeated_share * np.isfinite(value[:, i]).sum()",
+        "same[:, i].sum() - within > rare * (np.isfinite(value[:, i]).sum() - within)",
+        "same[:, i].sum() > rare * np.isfinite(value[:, i]).sum()",
         ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
     ),
     Mutation(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import gzip
+import math
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
-from soilbus.pipeline.intake import coverage
+from soilbus.pipeline.intake import silences
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.frames import frames
@@ -114,7 +115,7 @@ def test_a_byte_order_mark_before_a_log_is_no_part_of_it(tmp_path):
 
 
 @pytest.mark.parametrize("bin_length", [0.1, 0.25, 0.5])
-def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
+def test_silent_half_seconds_of_each_channel_add_up(bin_length: float) -> None:
     quantities = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
     noise = dict.fromkeys(quantities, SensorNoise(absolute=1.0))
     rig = Rig(("A", "B"), np.ones(2), np.ones(2), np.array([True, False]), None, noise)
@@ -123,9 +124,9 @@ def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
     sparse = np.array([0.1, 0.2, 7.3])
     samples = {"torque.A": steady, "load.B": late, "draft": sparse}
     store.add({name: (t, np.ones(len(t))) for name, t in samples.items()})
-    share = dict(zip(rig.channels, coverage(store.window(0.0, 10.0), 0.5).tolist(), strict=True))
-    assert share == dict.fromkeys(rig.channels, 0.0) | {"torque.A": 1.0, "load.B": 0.6, "draft": 0.1}
-    assert not coverage(store.window(0.0, bin_length), 0.5).any()
+    silent = dict(zip(rig.channels, silences(store.window(0.0, 10.0), 0.5), strict=True))
+    assert silent == dict.fromkeys(rig.channels, 10.0) | {"torque.A": 0.0, "load.B": 4.0, "draft": 9.0}
+    assert min(silences(store.window(0.0, bin_length), 0.5)) == math.inf
 
 
 def test_an_estimator_beside_gives_the_same_results(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import islice
 
-from fleet import Fault, fleet
+from fleet import logs_with
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.estimation.assembly import prior_of
@@ -30,8 +30,7 @@ def test_beside_a_large_effect_in_one_search():
 
 def test_beside_an_effect_of_the_configuration():
     """As `diagnose --model-out` writes it from one log, and a second log is diagnosed beside it."""
-    hidden = fleet(33, {}, Fault("tyre_deflection:spring", 1.1e-6), vehicles=2, logs=2)
-    first, second = hidden.vehicles[1]
+    first, second = logs_with("tyre_deflection:spring", 1.1e-6, seed=33)
     fitted = fit_model([first], PRIOR, [TYRE])
     assert fitted is not None
     values = fitted.parameters()[TYRE.name]

@@ -72,8 +72,7 @@ def windows(recording: Recording):
 
 
 def judged(window: Window, motor=None) -> tuple[str, ...]:
-    s = CONFIG.estimator
-    return implausible(window, RIG, s.min_speed, s.max_turn, s.bin, {}, motor)
+    return implausible(window, RIG, CONFIG.estimator, {}, motor)
 
 
 @pytest.mark.parametrize("name", DRIVES)
@@ -207,7 +206,7 @@ def test_what_does_not_last_or_is_not_driven_is_not_judged(good):
 def test_readings_may_repeat_as_often_as_their_noise_lets_them(good):
     """With steps of s and noise sd the chance of n equal readings is at most (P(|x| < s / 2))^(n - 1)."""
     window, _ = good
-    noise, s = RIG.noise["draft"], CONFIG.estimator
+    noise = RIG.noise["draft"]
     draft = window.draft.copy()
     draft[20:60] = 3000.0
     frozen = _changed(window, draft=draft)
@@ -215,12 +214,12 @@ def test_readings_may_repeat_as_often_as_their_noise_lets_them(good):
     for step in (1.0, 40.0, 100.0, 150.0, 200.0, 400.0):
         same = 1.0 - 2.0 * norm.sf(step / 2.0 / noise.absolute)
         expected = ("draft",) if (samples - 1.0) * math.log(same) < math.log(1e-12) else ()
-        told = implausible(frozen, RIG, s.min_speed, s.max_turn, s.bin, {"draft": Resolution(step, False)})
+        told = implausible(frozen, RIG, CONFIG.estimator, {"draft": Resolution(step, False)})
         assert told == expected, step
     at_rest = _changed(window, draft=np.zeros_like(draft))
     for rests, names in ((True, ()), (False, ("draft",))):
         given = {"draft": Resolution(1.0, rests)}
-        assert implausible(at_rest, RIG, s.min_speed, s.max_turn, s.bin, given) == names
+        assert implausible(at_rest, RIG, CONFIG.estimator, given) == names
 
 
 def test_a_radar_coarser_than_its_signal_is_not_frozen(good):

@@ -484,9 +484,9 @@ def faulty_windows() -> tuple[tuple[str, Window, Array], ...]:
 def contradictions(options: ConsistencyOptions) -> list[Contradiction]:
     """What is named in each window."""
     config = reference_configuration()
-    rig, s = rig_of(config), config.estimator
+    rig = rig_of(config)
     return [
-        Contradiction(fault, implausible(window, rig, s.min_speed, s.max_turn, s.bin, {}, motor, options))
+        Contradiction(fault, implausible(window, rig, config.estimator, {}, motor, options))
         for fault, window, motor in faulty_windows()
     ]
 

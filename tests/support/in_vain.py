@@ -161,6 +161,13 @@ def continued(
     return replace(done, columns={name: np.concatenate([done.columns[name], new[name]]) for name in done.columns})
 
 
+def as_driven(config: Config, seed: int, columns: dict[str, np.ndarray]) -> Drive:
+    """A drive of these columns by time, the others as at the end of a drive on loam."""
+    done = driven(config, seed, 3.0, None)
+    rest = {name: np.resize(column[-1:], len(columns["t"])) for name, column in done.columns.items()}
+    return replace(done, columns=rest | columns)
+
+
 def told(done: Drive, config: Config, seed: int, begins: float) -> Story:
     """What the sensors send of it."""
     messages = list(frames(Recording(done.columns, measure(done, config, seed), seed), config))
@@ -202,7 +209,6 @@ def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: f
     found = [brute_with_rolling(SOILS[soil], slip, dead) for slip in slips]
     pulls = np.array([pull for pull, _ in found])
     rng = np.random.default_rng([seed, 3])
-    done = driven(config, seed, 3.0, None)
     t = np.arange(0.0, seconds, 1.0 / SAMPLE_RATE)
     phase = rng.uniform(0.0, 6.0, 2)
     slip = 0.325 + 0.0875 * (np.sin(0.7 * t + phase[0]) + np.sin(1.1 * t + phase[1]))
@@ -213,8 +219,7 @@ def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: f
         of_wheel = {"load": load, "torque": torque, "sinkage": w.radius * (1.0 - np.cos(angle))}
         columns |= {f"{quantity}.{w.name}": np.interp(slip, slips, column) for quantity, column in of_wheel.items()}
         columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - np.interp(slip, slips, s)))
-    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
-    return told(replace(done, columns=rest | columns), config, seed, 0.0), float(pulls.max())
+    return told(as_driven(config, seed, columns), config, seed, 0.0), float(pulls.max())
 
 
 def with_a_soft_side(config: Config, soft: str, seed: int, over: float = 3.0) -> tuple[Story, float, float]:
@@ -247,9 +252,7 @@ def with_a_soft_side(config: Config, soft: str, seed: int, over: float = 3.0) ->
                 [np.interp(s, slips, row) for s, row in zip(slip, of_time, strict=True)]
             )
         columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - slip))
-    done = driven(config, seed, 3.0, None)
-    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
-    return told(replace(done, columns=rest | columns), config, seed, begins), most, held
+    return told(as_driven(config, seed, columns), config, seed, begins), most, held
 
 
 def with_weak_motors(
@@ -305,15 +308,10 @@ def with_weak_motors(
     columns["pitch"] = 0.0 * t
     for i, w in enumerate(config.wheel):
         _, torque, angle, slip, load = by_wheel[:, i].T
-        columns |= {
-            f"torque.{w.name}": torque,
-            f"load.{w.name}": load,
-            f"sinkage.{w.name}": w.radius * (1 - np.cos(angle)),
-        }
+        columns |= {f"torque.{w.name}": torque, f"load.{w.name}": load}
+        columns[f"sinkage.{w.name}"] = w.radius * (1 - np.cos(angle))
         columns[f"speed.{w.name}"] = ground / (w.radius * (1.0 - slip))
-    done = driven(config, seed, 3.0, None)
-    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
-    story = told(replace(done, columns=rest | columns), config, seed, 0.0)
+    story = told(as_driven(config, seed, columns), config, seed, 0.0)
 
     def asked(at: float) -> float:
         since = at - story.begins

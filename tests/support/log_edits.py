@@ -106,41 +106,38 @@ class Log:
             ]
         return sorted(out, key=lambda f: f[0])
 
-    def changed(self, name: str, edit: Callable[[Stream], Stream | None]) -> Log:
-        """With one message's stream edited, or taken out (None)."""
-        stream = edit(self.streams[name])
-        others = {n: s for n, s in self.streams.items() if n != name}
-        return Log.of(others if stream is None else others | {name: stream})
-
 
 Edit = Callable[[Log, float], Log]
 """Of a log, from a time [s] on."""
 
 
-def split(path: str) -> tuple[str, str]:
-    message, _, signal = path.partition(".")
-    return message, signal
+def edit_of(places: Iterable[str], change: Callable[[Stream, str, Since], Stream]) -> Edit:
+    """The same change of messages, or of signals `Message.Signal`, in the frames of a mask (N,)."""
+
+    def edit(log: Log, t: float) -> Log:
+        for place in places:
+            message, _, signal = place.partition(".")
+            stream = log.streams[message]
+            log = Log.of(log.streams | {message: change(stream, signal, stream.t >= t)})
+        return log
+
+    return edit
 
 
 def cut(message: str) -> Edit:
     """Nothing follows."""
-    return lambda log, t: log.changed(message, lambda s: s.before(t) if (s.t < t).any() else None)
 
+    def edit(log: Log, t: float) -> Log:
+        rest = log.streams[message].before(t)
+        others = {name: stream for name, stream in log.streams.items() if name != message}
+        return Log.of(others | ({message: rest} if len(rest.t) else {}))
 
-def _edited(edit: Callable[[Stream, str], Stream], signal: str) -> Callable[[Stream], Stream]:
-    return lambda stream: edit(stream, signal)
+    return edit
 
 
 def mapped(*paths: str, by: Callable[[Array], Array]) -> Edit:
     """Values (N,) of signals replaced by a function of them."""
-
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
-            log = log.changed(message, _edited(lambda s, n: s.with_values(n, by(s.signal(n)), s.t >= t), signal))
-        return log
-
-    return edit
+    return edit_of(paths, lambda s, name, late: s.with_values(name, by(s.signal(name)), late))
 
 
 def flipped(*paths: str) -> Edit:
@@ -158,72 +155,40 @@ def offset(by: float, *paths: str) -> Edit:
     return mapped(*paths, by=lambda values: values + by)
 
 
+def last_good(late: Since) -> int:
+    """Number of the frame before the first late one."""
+    return max(int(np.sum(~late)) - 1, 0)
+
+
 def frozen(*paths: str) -> Edit:
     """The signals repeat their last good value; the rest of the frame goes on."""
-
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
-
-            def stuck(s: Stream, n: str = signal) -> Stream:
-                code = s.raw(n)
-                return s.with_codes(n, np.full(len(code), code[max(int(np.sum(s.t < t)) - 1, 0)]), s.t >= t)
-
-            log = log.changed(message, stuck)
-        return log
-
-    return edit
+    return edit_of(paths, lambda s, name, late: s.with_codes(name, s.raw(name)[[last_good(late)] * len(late)], late))
 
 
 def stalled(message: str) -> Edit:
     """The whole frame is repeated, counter and checksum with it."""
-
-    def edit(s: Stream, t: float) -> Stream:
-        payload = s.payload.copy()
-        payload[s.t >= t] = payload[max(int(np.sum(s.t < t)) - 1, 0)]
-        return s.with_payload(payload)
-
-    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+    return edit_of(
+        [message], lambda s, _, late: s.with_payload(np.where(late[:, None], s.payload[last_good(late)], s.payload))
+    )
 
 
 def spiked(by: float, every: int, *paths: str) -> Edit:
     """Every so many samples one stands out by so much."""
 
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
+    def spikes(s: Stream, name: str, late: Since) -> Stream:
+        return s.with_values(name, s.signal(name) + by, late & (np.arange(len(late)) % every == 0))
 
-            def spikes(s: Stream, n: str = signal) -> Stream:
-                hit = (s.t >= t) & (np.arange(len(s.t)) % every == 0)
-                return s.with_values(n, s.signal(n) + by, hit)
-
-            log = log.changed(message, spikes)
-        return log
-
-    return edit
+    return edit_of(paths, spikes)
 
 
 def codes(code: int, *paths: str) -> Edit:
     """A code that means no value."""
-
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
-            log = log.changed(message, _edited(lambda s, n: s.with_codes(n, np.full(len(s.t), code), s.t >= t), signal))
-        return log
-
-    return edit
+    return edit_of(paths, lambda s, name, late: s.with_codes(name, np.full(len(late), code), late))
 
 
 def delayed(by: float, *messages: str) -> Edit:
     """Frames come, and are stamped, so much later [s]."""
-
-    def edit(log: Log, t: float) -> Log:
-        for message in messages:
-            log = log.changed(message, lambda s: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))
-        return log
-
-    return edit
+    return edit_of(messages, lambda s, _, late: Stream(s.message, s.t + by * late, s.payload))
 
 
 class Restamped(Log):
@@ -251,24 +216,14 @@ def swapped(a: str, b: str) -> Edit:
     """Two signals of the same layout exchanged (both messages at the same rate, as their frames come)."""
 
     def edit(log: Log, t: float) -> Log:
-        (ma, sa), (mb, sb) = split(a), split(b)
-        one, other = log.streams[ma], log.streams[mb]
-        va, vb = one.signal(sa), other.signal(sb)
-        of_b = np.interp(one.t, other.t, vb)
-        of_a = np.interp(other.t, one.t, va)
-        log = log.changed(ma, lambda s: s.with_values(sa, of_b, s.t >= t))
-        return log.changed(mb, lambda s: s.with_values(sb, of_a, s.t >= t))
+        old = dict(log.streams)
 
-    return edit
+        def of_the_other(s: Stream, name: str, late: Since) -> Stream:
+            message, _, signal = (b if f"{s.message.name}.{name}" == a else a).partition(".")
+            other = old[message]
+            return s.with_values(name, np.interp(s.t, other.t, other.signal(signal)), late)
 
-
-def every_frame(change: Callable[[Stream, float], Stream]) -> Edit:
-    """The same edit of all streams."""
-
-    def edit(log: Log, t: float) -> Log:
-        for name in log.streams:
-            log = log.changed(name, lambda s: change(s, t))
-        return log
+        return edit_of((a, b), of_the_other)(log, t)
 
     return edit
 
@@ -276,53 +231,55 @@ def every_frame(change: Callable[[Stream, float], Stream]) -> Edit:
 def duplicated(log: Log, t: float) -> Log:
     """Each frame comes twice, 0.2 ms apart."""
 
-    def twice(s: Stream, t: float) -> Stream:
-        late = s.t >= t
-        stamps = np.concatenate([s.t, s.t[late] + 2e-4])
-        order = np.argsort(stamps, kind="stable")
-        return Stream(s.message, stamps[order], np.concatenate([s.payload, s.payload[late]])[order])
+    def twice(s: Stream, _: str, late: Since) -> Stream:
+        return with_added(s, s.t[late] + 2e-4, s.payload[late])
 
-    return every_frame(twice)(log, t)
+    return edit_of(log.streams, twice)(log, t)
+
+
+def with_added(s: Stream, t: Array, payload: NDArray[np.uint8]) -> Stream:
+    """With more frames, in the order of their stamps."""
+    stamps = np.concatenate([s.t, t])
+    order = np.argsort(stamps, kind="stable")
+    return Stream(s.message, stamps[order], np.concatenate([s.payload, payload])[order])
 
 
 def reordered(log: Log, t: float) -> Log:
     """Each second frame changes places with the one before: the payloads come in the wrong order."""
 
-    def exchange(s: Stream, t: float) -> Stream:
-        order = np.arange(len(s.t))
-        first = np.flatnonzero(s.t >= t)[: -1 if int(np.sum(s.t >= t)) % 2 else None]
-        order[first[0::2]], order[first[1::2]] = first[1::2], first[0::2]
+    def exchange(s: Stream, _: str, late: Since) -> Stream:
+        order, found = np.arange(len(late)), np.flatnonzero(late)
+        pairs = found[: len(found) // 2 * 2].reshape(-1, 2)
+        order[pairs] = pairs[:, ::-1]
         return s.with_payload(s.payload[order])
 
-    return every_frame(exchange)(log, t)
+    return edit_of(log.streams, exchange)(log, t)
 
 
 def broken_checksums(message: str) -> Edit:
     """The Checksum's last bit is wrong."""
 
-    def edit(s: Stream, t: float) -> Stream:
+    def edit(s: Stream, _: str, late: Since) -> Stream:
         payload = s.payload.copy()
-        payload[s.t >= t, checkable_byte(s.message)] ^= 1
+        payload[late, checkable_byte(s.message)] ^= 1
         return s.with_payload(payload)
 
-    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+    return edit_of([message], edit)
 
 
 def joined_by(message: str, extra: int) -> Edit:
     """A second sender adds frames to each one: a byte differs, counters jump, the Checksum is right."""
 
-    def edit(s: Stream, t: float) -> Stream:
-        origin = np.repeat(np.flatnonzero(s.t >= t), extra)
+    def edit(s: Stream, _: str, late: Since) -> Stream:
+        origin = np.repeat(np.flatnonzero(late), extra)
         payload = s.payload[origin]
         payload[:, 0] ^= 0x10
         other = Stream(s.message, s.t[origin] + 0.001 * (1 + np.arange(len(origin)) % extra), payload)
         counters = np.random.default_rng(7).integers(16, size=len(origin))
         other = other.with_codes("Counter", counters, np.ones(len(origin), np.bool_))
-        stamps = np.concatenate([s.t, other.t])
-        order = np.argsort(stamps)
-        return Stream(s.message, stamps[order], np.concatenate([s.payload, other.payload])[order])
+        return with_added(s, other.t, other.payload)
 
-    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+    return edit_of([message], edit)
 
 
 def both(*edits: Edit) -> Edit:

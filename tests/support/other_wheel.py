@@ -1,4 +1,4 @@
-"""A second formula of a wheel on soil: Wong & Reece 1967 by the midpoint rule, nothing of soilbus in it.
+"""A second formula of a wheel on soil: Wong & Reece 1967 by Gauss's rule over each branch, nothing of soilbus in it.
 
 The greatest stress sits at (c1 + c2 s) of the entry angle, contact ends `exit` times the entry angle behind the
 axle; the stress behind the greatest one is that in front at the same share of its branch.
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-STRIPS = 300
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 class Contact(NamedTuple):
@@ -25,32 +25,43 @@ class Contact(NamedTuple):
 
 def forces(soil: Any, contact: Contact, angle: Any, slip: Any, radius: float, width: float) -> tuple[Any, Any, Any]:
     """Load [N], drawbar pull [N] and torque [N m] (N,) at entry angles [rad] (N,) and slips (N,)."""
-    angle, slip = np.asarray(angle)[:, None], np.asarray(slip)[:, None]
-    middle = (np.arange(STRIPS) + 0.5) / STRIPS
-    rear = -contact.exit * angle
-    step = (angle - rear) / STRIPS
-    theta = rear + (angle - rear) * middle
-    peak = (contact.c1 + contact.c2 * slip) * angle
-    front = np.where(theta > peak, theta, angle - (theta - rear) / (peak - rear) * (angle - peak))
-    depth = radius * (np.cos(front) - np.cos(angle))
-    pressure = (soil.k_c / width + soil.k_phi) * np.maximum(depth, 0.0) ** soil.n
-    j = radius * (angle - theta - (1.0 - slip) * (np.sin(angle) - np.sin(theta)))
-    share = j / (j + soil.K) if contact.rational else 1.0 - np.exp(-j / soil.K)
-    shear = (soil.c + pressure * np.tan(soil.phi)) * share
-    area = radius * width * step
-    load = (area * (pressure * np.cos(theta) + shear * np.sin(theta))).sum(1)
-    pull = (area * (shear * np.cos(theta) - pressure * np.sin(theta))).sum(1)
-    return load, pull, radius * (area * shear).sum(1)
+    angle, slip = np.asarray(angle, float), np.asarray(slip, float)
+    front, stiffness = angle * (1.0 - contact.c1 - contact.c2 * slip), soil.k_c / width + soil.k_phi
+    load, pull, torque = np.zeros((3, len(angle)))
+    for node, weight in zip(((_NODES + 1.0) / 2.0).tolist(), (_WEIGHTS / 2.0).tolist(), strict=True):
+        share = node**3  # nodes gather at the edges of the contact, where the stress has a root
+        pressure = stiffness * (radius * (np.cos(angle - share * front) - np.cos(angle))) ** soil.n
+        for edge in (angle, -contact.exit * angle):
+            branch = edge - (angle - front)  # from the greatest stress to the edge
+            theta = edge - share * branch
+            j = radius * (angle - theta - (1.0 - slip) * (np.sin(angle) - np.sin(theta)))
+            mobilised = np.abs(j) / (np.abs(j) + soil.K) if contact.rational else -np.expm1(-np.abs(j) / soil.K)
+            shear = (soil.c + pressure * np.tan(soil.phi)) * np.sign(j) * mobilised
+            area = radius * width * np.abs(branch) * 3.0 * node**2 * weight
+            load += area * (pressure * np.cos(theta) + shear * np.sin(theta))
+            pull += area * (shear * np.cos(theta) - pressure * np.sin(theta))
+            torque += area * radius * shear
+    return load, pull, torque
 
 
 def carrying(soil: Any, contact: Contact, load: Any, slip: Any, radius: float, width: float) -> Any:
-    """Entry angles [rad] (N,) at which wheels carry these loads [N] (N,), by bisection."""
-    low, high = np.full(len(load), 1e-3), np.full(len(load), 1.3)
-    for _ in range(40):
-        middle = (low + high) / 2.0
-        heavy = forces(soil, contact, middle, slip, radius, width)[0] > load
-        low, high = np.where(heavy, low, middle), np.where(heavy, middle, high)
-    return (low + high) / 2.0
+    """Entry angles [rad] (N,) at which wheels carry these loads [N] (N,): a secant in logarithms."""
+
+    def off(log_angle: Any) -> Any:
+        return np.log(forces(soil, contact, np.exp(log_angle), slip, radius, width)[0] / load)
+
+    power = 1.0 / (2.0 * soil.n + 1.0)
+    stiffness = (3.0 - soil.n) * width * (soil.k_c / width + soil.k_phi) * np.sqrt(2.0 * radius)
+    depth = (3.0 * np.asarray(load) / stiffness) ** (2.0 * power)  # Bekker's rigid wheel
+    before = np.log(np.clip(np.arccos(np.clip(1.0 - depth / radius, 0.2, 1.0)), 0.05, 1.2))
+    of_before = off(before)
+    now = before - power * of_before
+    for _ in range(6):
+        of_now, step = off(now), now - before
+        by = np.where(np.abs(step) > 1e-12, (of_now - of_before) / np.where(step == 0.0, 1.0, step), 1.0 / power)
+        before, of_before = now, of_now
+        now = np.clip(now - of_now / np.where(by > 0.1, by, 1.0 / power), np.log(0.02), np.log(1.5))
+    return np.exp(now)
 
 
 def readings(

@@ -8,8 +8,6 @@ the prior: a missing effect is then a difference between the two wheels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,34 +25,6 @@ from soilbus.terra.effects.catalogue import CATALOGUE
 RIGS = Path(__file__).with_name("rigs")
 LUG = 0.01
 """Height of the lugs [m] of the two rigs that had both wheels."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One wheel's points, with errors times those of its rig.
-
-    soil: "tests" where published soil tests were the prior, else the wheel that was fitted
-    before in the same soil.
-    """
-
-    rig: str
-    wheel: str
-    soil: str
-    errors: float
-    found: Diagnosis
-
-
-def cases(errors: float, points: Path) -> Iterator[Case]:
-    """Every wheel by itself, then each after the other in the same soil."""
-    for rig in ("ding2011", "kls1"):
-        alone: dict[str, Diagnosis] = {}
-        for wheel in ("smooth", "lugged"):
-            alone[wheel] = diagnosed(rig, wheel, errors, points)
-            yield Case(rig, wheel, "tests", errors, alone[wheel])
-        for wheel, other in (("lugged", "smooth"), ("smooth", "lugged")):
-            found = diagnosed(rig, wheel, errors, points, alone[other].completed)
-            yield Case(rig, wheel, f"{other} wheel", errors, found)
-    yield Case("rashid1", "lugged", "tests", errors, diagnosed("rashid1", "lugged", errors, points))
 
 
 def configuration(rig: str, wheel: str, errors: float = 1.0) -> Config:

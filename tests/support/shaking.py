@@ -2,8 +2,7 @@
 
 Nothing of soilbus is used.  Body bounce, pitch and roll (2 to 5 Hz) shake the wheel loads; the motors hold
 their rim speeds and the ground speed follows by m dV/dt = sum DP - D - m g sin(slope), integrated at STEP.
-The contact is Wong & Reece's (J. Terramechanics 4(1), 1967) with Janosi & Hanamoto's shear, the stresses
-integrated directly over the angle.  Each message has its own rate, phase and jitter, each channel its own
+The contact is that of `other_wheel`.  Each message has its own rate, phase and jitter, each channel its own
 delay, first-order lag, noise and fixed gain error (shared/field/README.md).
 """
 
@@ -20,6 +19,8 @@ from typing import Any, NamedTuple
 import cantools
 import numpy as np
 from numpy.typing import NDArray
+
+from other_wheel import Contact, carrying, forces
 
 Array = NDArray[Any]
 
@@ -200,8 +201,8 @@ def _truth(rng: np.random.Generator, ground: Ground, duration: float, shake: flo
     slip = 1.0 - speed / (RADIUS[:, None] * omega)
     columns = {"t": t, "ground_speed": speed, "acceleration": acceleration, "draft": draft, "pitch": slope}
     for i, wheel in enumerate(WHEELS):
-        angle = _entry_angle(ground, i, load[i], slip[i])
-        torque = _contact(ground, RADIUS[i], WIDTH[i], angle, slip[i])[2]
+        angle = carrying(ground, Contact(), load[i], slip[i], RADIUS[i], WIDTH[i])
+        torque = forces(ground, Contact(), angle, slip[i], RADIUS[i], WIDTH[i])[2]
         columns |= {f"load.{wheel}": load[i], f"torque.{wheel}": torque, f"speed.{wheel}": omega[i]}
         columns |= {f"sinkage.{wheel}": RADIUS[i] * (1.0 - np.cos(angle)), f"slip.{wheel}": slip[i]}
     return columns
@@ -259,8 +260,8 @@ class _PullTable:
 
     def __init__(self, ground: Ground, wheel: int) -> None:
         load, slip = (a.ravel() for a in np.meshgrid(self.LOADS, self.SLIPS, indexing="ij"))
-        angle = _entry_angle(ground, wheel, load, slip)
-        pull = _contact(ground, RADIUS[wheel], WIDTH[wheel], angle, slip)[1]
+        angle = carrying(ground, Contact(), load, slip, RADIUS[wheel], WIDTH[wheel])
+        pull = forces(ground, Contact(), angle, slip, RADIUS[wheel], WIDTH[wheel])[1]
         self.rows = pull.reshape(len(self.LOADS), -1).tolist()
 
     def at(self, load: float, slip: float) -> float:
@@ -275,48 +276,3 @@ class _PullTable:
 def _pull_table(ground: Ground, wheel: int) -> _PullTable:
     """The table of a wheel on a ground, made once."""
     return _PullTable(ground, wheel)
-
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
-
-
-def _contact(ground: Ground, r: float, b: float, entry: Array, slip: Array) -> tuple[Array, Array, Array]:
-    """Load [N], drawbar pull [N], torque [N m] of wheels (N,) at entry angles [rad] and slips.
-
-    The greatest stress is half way; behind it the front's stresses come back mirrored.
-    """
-    stiffness = (ground.k_c / b + ground.k_phi) * r**ground.n
-    load, pull, torque = (np.zeros(len(entry)) for _ in range(3))
-    for node, weight in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
-        u = 0.5 * (node + 1.0)
-        share = u**3  # nodes gather at the edges of the contact, where the stress has a root
-        of_front = 1.0 - 0.5 * share
-        for of_entry, mirrored in ((of_front, of_front), (0.5 * share, 1.0 - 0.5 * share)):
-            theta = of_entry * entry
-            sigma = stiffness * np.maximum(np.cos(mirrored * entry) - np.cos(entry), 0.0) ** ground.n
-            j = r * (entry - theta - (1.0 - slip) * (np.sin(entry) - np.sin(theta)))
-            tau = (ground.c + sigma * math.tan(ground.phi)) * np.sign(j) * -np.expm1(-np.abs(j) / ground.K)
-            area = b * r * entry * 0.5 * 3.0 * u**2 * 0.5 * weight
-            load += area * (sigma * np.cos(theta) + tau * np.sin(theta))
-            pull += area * (tau * np.cos(theta) - sigma * np.sin(theta))
-            torque += area * r * tau
-    return load, pull, torque
-
-
-def _entry_angle(ground: Ground, wheel: int, load: Array, slip: Array) -> Array:
-    """Entry angles [rad] (N,) at which the soil carries the loads: a secant in logarithms."""
-    r, b = float(RADIUS[wheel]), float(WIDTH[wheel])
-    power = 1.0 / (2.0 * ground.n + 1.0)
-    plate = (3.0 * load / ((3.0 - ground.n) * b * (ground.k_c / b + ground.k_phi) * math.sqrt(2.0 * r))) ** (
-        2.0 * power
-    )
-    angle = np.clip(np.arccos(np.clip(1.0 - plate / r, 0.2, 1.0)), 0.05, 1.2)  # Bekker's rigid wheel
-    log_angle, off = np.log(angle), np.log(_contact(ground, r, b, angle, slip)[0] / load)
-    new = log_angle - power * off
-    for _ in range(4):
-        here = np.log(_contact(ground, r, b, np.exp(new), slip)[0] / load)
-        step = new - log_angle
-        by = np.where(np.abs(step) > 1e-12, (here - off) / np.where(step == 0.0, 1.0, step), 1.0 / power)
-        log_angle, off = new, here
-        new = np.clip(new - here / np.where(by > 0.1, by, 1.0 / power), math.log(0.02), math.log(1.5))
-    return np.asarray(np.exp(new))

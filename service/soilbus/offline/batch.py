@@ -99,14 +99,8 @@ def run_batch(
     With `diagnose` each vehicle is diagnosed over its logs, and the fleet. With `retry` logs that failed or were
     damaged are read again, and vehicles diagnosed again that lack a log. `progress` is called with what is done.
 
-    Raises
-    ------
-    ConfigError
-        The configuration fits no log.
-    BatchError
-        The scheduler is lost, or a part cannot be read.
-    NotWritten
-        A file cannot be written.
+    ConfigError where the configuration fits no log; BatchError where the scheduler is lost, or a part cannot be read;
+    NotWritten where a file cannot be written.
     """
     parts = out / "parts"
     before = {digest: each for digest, each in _all_kept(jobs, parts).items() if not (retry and each.fault)}

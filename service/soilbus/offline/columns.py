@@ -261,7 +261,7 @@ def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = Non
         raise TableError(f"{path}: no column {time.time}{did_you_mean(time.time, cells)}")
     units = {name: str(column[0]).strip() for name, column in cells.items() if len(column)}
     first = cells[time.time][0] if units else None
-    begin = int(bool(str(first or "").strip()) and math.isinf(number(first)) and _date(first) is None)
+    begin = int(bool(str(first or "").strip()) and math.isinf(number(first)) and seconds_of_date(first) is None)
     t = _times(path, time, cells[time.time][begin:])
     order = np.arange(len(t), dtype=np.float64)
     series = {}
@@ -280,8 +280,8 @@ def time_column(path: Path) -> str:
     return next((name for name in names if TIME_NAMES.fullmatch(re.split(r"[ _\[(/]", name)[0] or "index")), "")
 
 
-def _date(cell: Any) -> float | None:
-    """Seconds since 1970 of a date, in UTC where it names no zone; None for what is none."""
+def seconds_of_date(cell: Any) -> float | None:
+    """Return the seconds since 1970 of a date, in UTC where it names no zone; None for what is none."""
     try:
         when = cell if isinstance(cell, datetime) else datetime.fromisoformat(str(cell).strip())
     except ValueError:
@@ -297,7 +297,7 @@ def _times(path: Path, time: TimeColumn, cells: Sequence[Any]) -> Array:
         unit = time.unit or (ending[1] if ending and ending[1] in _TIMES else "s")
         times = np.where(np.isfinite(times), times * _TIMES[unit], math.inf)
     else:
-        dates = [_date(cell) for cell in cells]
+        dates = [seconds_of_date(cell) for cell in cells]
         if dates and not any(date is not None for date in dates):
             seen = f"{shown(cells[0], 40)!r} is neither a number nor a date as 2026-05-01T12:00:00.1"
             raise TableError(f"{path}: column {time.time} holds no time: {seen}")

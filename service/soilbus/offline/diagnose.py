@@ -80,14 +80,7 @@ def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Con
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
     """Read logs, or with [table] tables, and diagnose them together; `say` is called with the name of each phase.
 
-    Raises
-    ------
-    LogError, TooLittle
-        As recordings_of().
-    NotFitted
-        The present model cannot be fitted.
-    ConfigError
-        Configuration and database do not fit together.
+    LogError, TooLittle and ConfigError as recordings_of(); NotFitted where the present model cannot be fitted.
     """
     report = say or (lambda _: None)
     if config.table is None:

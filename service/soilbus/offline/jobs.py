@@ -9,8 +9,7 @@ import glob
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import partial
 from io import BytesIO
@@ -23,7 +22,7 @@ from soilbus.config.model import Config
 from soilbus.files import opened, plain_bytes, read_all
 from soilbus.offline import dataset
 from soilbus.offline.cluster import BatchError
-from soilbus.offline.columns import MISSING_CELLS, PACKED, check_cells, csv_rows
+from soilbus.offline.columns import MISSING_CELLS, PACKED, check_cells, csv_rows, number, seconds_of_date
 from soilbus.offline.parts import Job, Setup, file_name, kept_of, place_of, setup_of
 from soilbus.pipeline.result import is_date
 from soilbus.words import one_line
@@ -44,12 +43,7 @@ def jobs_of(
     vehicle there it is that of the folder in which the log lies. A log that was read before in a folder that is named
     here, of which `parts` holds the windows and that is no longer there, keeps its job.
 
-    Raises
-    ------
-    ConfigError
-        A configuration is wrong.
-    BatchError
-        There is no log, or a manifest cannot be read.
+    ConfigError where a configuration is wrong, BatchError where there is no log or a manifest cannot be read.
     """
     setups: dict[Path | None, Setup] = {}
 
@@ -199,16 +193,11 @@ def _parquet_rows(file: BinaryIO) -> tuple[list[str], list[tuple[int, dict[str, 
 def _start(text: str | None, manifest: str) -> float | None:
     if not text or text.lower() in MISSING_CELLS:
         return None
-    seconds = math.nan
-    with suppress(ValueError):
-        seconds = float(text)  # a day may look so, too: 20240501
-    with suppress(ValueError):
-        if not is_date(seconds):
-            when = datetime.fromisoformat(text)
-            return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-    if not math.isfinite(seconds):
+    seconds = number(text)  # a day may look so, too: 20240501
+    date = None if is_date(seconds) else seconds_of_date(text)
+    if date is None and not math.isfinite(seconds):
         raise BatchError(f"{manifest}: start {text} is neither ISO 8601 nor seconds since 1970")
-    return seconds
+    return seconds if date is None else date
 
 
 def _files(log: str, suffixes: Sequence[str]) -> list[str]:

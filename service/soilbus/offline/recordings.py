@@ -53,14 +53,8 @@ def recordings_of(
     With `partial` what lies before the damage of a log counts. `progress` is called with the number of frames read and
     the time in the recording [s].
 
-    Raises
-    ------
-    LogError
-        A log cannot be read to its end (with `partial`: at all), is of another bus, or is given twice.
-    TooLittle
-        A log has no usable part.
-    ConfigError
-        Configuration and database do not fit together.
+    LogError where a log cannot be read to its end (with `partial`: at all), is of another bus, or is given twice;
+    TooLittle where it has no usable part; ConfigError where configuration and database do not fit together.
     """
     check_different(logs)
     rig, model, settings = rig_of(config), model_of(config), config.estimator

@@ -80,12 +80,7 @@ def replay(
     The pipeline counts frames and refusals of all logs, and numbers their windows on. With `workers`, an executor of
     `estimator_beside`, reading and estimating overlap, with the same results. `progress` is called now and then with
     the number of frames read and the time in the recording [s]; `on_fault` with the error of a log that is damaged or
-    of another bus, after which the next log follows.
-
-    Raises
-    ------
-    LogError
-        A log is damaged or of another bus and `on_fault` is None; after the windows before that place.
+    of another bus, after which the next log follows; where it is None the LogError comes after the windows before.
     """
     tasks = _tasks(pipeline, logs, progress, on_fault)
     if workers is None:
@@ -138,16 +133,9 @@ def _tasks(
 
 
 def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
-    """Feed the frames of a log to an intake, and say how far it is.
+    """Feed the frames of a log to an intake, and yield the time [s] as windows end, every second, and at the end.
 
-    Yields
-    ------
-    The time [s] when a window has ended (once, taken or not), every second of the recording, and at its end.
-
-    Raises
-    ------
-    LogError
-        As `Log.frames`; where the last frame is not whole; where no frame is of a mapped message.
+    LogError as `Log.frames`; where the last frame is not whole; where no frame is of a mapped message.
     """
     admission, counts = intake.admission, intake.admission.counts
     feed = admission.feed

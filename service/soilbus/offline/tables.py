@@ -61,10 +61,7 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     of CSV are separated by commas, semicolons or tabs; beside the latter two numbers may have decimal commas. Runs are
     called by `name`, by default the file's, with the soil bed where [table] run is given.
 
-    Raises
-    ------
-    TableError
-        The file cannot be read, a column is missing, a cell is no number, or no row is left.
+    TableError where the file cannot be read, a column is missing, a cell is no number, or no row is left.
     """
     return _runs(config, read_columns(path, _needed(_table_of(config, str(path)))), str(path), name or path.name)
 

@@ -20,14 +20,10 @@ from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 
 @dataclass(frozen=True, slots=True)
 class Corrections:
-    """Corrections of one window: torque limits and draft.
+    """Corrections of one window.
 
-    Attributes
-    ----------
-    torque_ceiling
-        Of each wheel [N m], inf where none is known; empty before the first window.
-    effects
-        Effects of the model with their fitted values.
+    torque_ceiling: of each wheel [N m], inf where none is known, empty before the first window; effects: those of the
+    model with their fitted values.
     """
 
     torque_ceiling: tuple[float, ...] = ()

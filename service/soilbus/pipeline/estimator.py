@@ -55,28 +55,13 @@ UNSETTLED = (TrackerState.SUSPECT, TrackerState.TRANSITION)
 
 @dataclass(frozen=True, slots=True)
 class Undecided:
-    """Estimate of a window with the inputs of its decision, which is still to be made.
+    """Estimate of a window, its traversability unknown, with the inputs of the decision still to be made.
 
-    Attributes
-    ----------
-    result
-        With an unknown traversability.
-    posterior
-        Of the soil, with the covariance due to the model's form that `model` has; None where there is no estimate.
-    demand
-        None where the draft is not known.
-    torque_limit
-        (W,) [N m], nan where not known.
-    driven
-        The window's data, its draft corrected by the fitted effects of the draft sensor.
-    fresh
-        Nothing may be carried over from the window before.
-    model
-        With the uncertainty that the window leaves of the effects' parameters and of the form.
-    here
-        Whether the estimate is of the present ground.
-    rig
-        The vehicle with its estimated mass.
+    posterior: of the soil, with the covariance due to the model's form that `model` has; demand: None where the draft
+    is not known; torque_limit: (W,) [N m], nan where not known; driven: the window's data, its draft corrected by the
+    fitted effects of the draft sensor; fresh: nothing may be carried over from the window before; model: with the
+    uncertainty that the window leaves of the effects' parameters and of the form; here: whether the estimate is of the
+    present ground; rig: the vehicle with its estimated mass.
     """
 
     result: WindowResult
@@ -93,12 +78,7 @@ class Undecided:
 class WindowEstimator:
     """Estimator of one window after the other: soil, status, decision, warning.
 
-    Parameters
-    ----------
-    config
-        Vehicle, prior, model, settings.
-    tracker_of
-        Makes the tracker from the arguments of `Tracker`; a test gives one whose soil is known.
+    `tracker_of` makes the tracker from the arguments of `Tracker`; a test gives one whose soil is known.
     """
 
     def __init__(self, config: Config, tracker_of: Callable[..., Tracker] = Tracker) -> None:

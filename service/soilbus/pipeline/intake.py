@@ -57,25 +57,20 @@ class WindowTask:
 
     Attributes
     ----------
-    index, epoch
-        Number of the window since the start, and number of restarts of the clock.
-    start, end
-        [s].
-    window, slip
-        The forward data, and mean slip by wheel (None where not known).
+    index, epoch, fresh
+        Number of the window since the start, number of restarts of the clock, and whether nothing may be carried over
+        from the window before.
+    start, end, late
+        [s], and the delay [s] of the latest channel, for which all others wait.
+    window, slip, track
+        The forward data, mean slip by wheel (None where not known), positions from the window's middle on.
     missing, poor, implausible, untrusted
-        Needed channels never received; needed channels that are stale at the end or cover the window badly; channels
-        that contradict the others and were removed from the window; channels of a message with a second sender.
+        Needed channels never received; needed channels that are stale at the end or silent too long; channels that
+        contradict the others and were removed from the window; channels of a message with a second sender.
     torque_limit
         (W,) [N m], nan where not known.
-    track
-        Positions from the window's middle on.
     rejected
         Refused samples by reason.
-    fresh
-        Nothing may be carried over from the window before.
-    late
-        [s], delay of the latest channel, for which all others wait.
     """
 
     index: int
@@ -150,17 +145,9 @@ class Refusals:
 class ReportedLimits:
     """Torque limit [N m] of each motor (W,): as reported, else as configured, else nan.
 
-    A reported limit holds until another one is reported, also through silence and a set clock.  It is the median of the
-    last samples.
-
-    A motor of several wheels gives each the share that `Motor.share` says; a wheel that is not driven has the limit 0.
-
-    Parameters
-    ----------
-    motors
-        Of the vehicle; a wheel's limit is that of the last motor with one that drives it.
-    samples
-        Number of the last samples.
+    The median of the last samples holds until another one is reported, also through silence and a set clock.  A motor
+    of several wheels gives each the share that `Motor.share` says; a wheel that is not driven has the limit 0, one of
+    several motors that of the last with a limit.
     """
 
     def __init__(self, motors: Motors, samples: int = RECEPTION.limit_samples) -> None:
@@ -200,26 +187,11 @@ class ReportedLimits:
 
 
 class Intake:
-    """Decoding, bins and freshness of one vehicle's channels.
+    """Decoding, bins and freshness of one vehicle's channels; ConfigError where configuration and database do not fit.
 
-    Parameters
-    ----------
-    config, database
-        The configuration and the messages of the vehicle's bus.
-    delays
-        [s] by quantity, added to each channel's `delay`; None takes those of the configured effects.
-    options
-        Which samples and which windows are used.
-
-    Raises
-    ------
-    ConfigError
-        Where configuration and database do not fit.
-
-    Notes
-    -----
-    Channels are aligned by delaying all others to the latest one.  So a window is complete, and its data are older than
-    its end by that delay.  Freshness goes by the stamps of the frames.
+    Channels are aligned by delaying all others to the latest one, by their `delay` and `delays` [s] by quantity (None:
+    those of the configured effects).  So a window is complete, and its data are older than its end by that delay.
+    Freshness goes by the stamps of the frames.
     """
 
     def __init__(
@@ -237,8 +209,7 @@ class Intake:
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
         self._of_position = {c.name: self._timeout(c) for c in self.channels if c.quantity in POSITION_ROLES}
-        self._positions = PositionTrack(self._of_position, options.fix_smoothing)
-        self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
+        self._positions = PositionTrack(self._of_position, options.timeout)
         of_effects = delays_of(config) if delays is None else delays
         late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
         self._latest = max([0.0, *late.values()])
@@ -280,7 +251,7 @@ class Intake:
         self._bins = None
         self._fresh = True
         self._positions.forget()
-        self._consistency.forget()
+        self._consistency = SensorConsistency(self.rig, self.channels, self._database, self._settings)
         self._limits.forget_times()
         self._implausible: tuple[str, ...] = ()
         self.next_end = math.inf
@@ -381,9 +352,10 @@ class Intake:
         missing = [c.name for c in self.needed if c.name not in self.last_seen]
         missing += ["ground_speed"] if self.config.signals.ground_speed is None else []
         missing += [] if self.rig.wheels else ["wheels"]
-        covered = dict(zip(self.rig.channels, coverage(raw, self._options.covered_block).tolist(), strict=True))
+        longest = self._options.timeout
+        silent = dict(zip(self.rig.channels, silences(raw, longest / 2.0), strict=True))
         stale = self.stale(end)
-        poor = [c.name for c in self.needed if c.name in stale or covered[c.name] < self._options.min_coverage]
+        poor = [c.name for c in self.needed if c.name in stale or silent[c.name] >= longest]
         task = WindowTask(
             index=self.ended,
             start=start,
@@ -473,13 +445,12 @@ def column_means(rows: Array) -> list[float | None]:
     return [float(s / n) if n else None for s, n in zip(total, count, strict=True)]
 
 
-def coverage(window: Window, span: float) -> Array:
-    """Return the share of a window's blocks of `span` [s] with a sample, by channel of the rig."""
-    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
-    known = np.isfinite(np.column_stack([getattr(window, q) for q in quantities]))
+def silences(window: Window, block: float) -> list[float]:
+    """Return the time [s] of a window's blocks of this length [s] without a sample, by channel of the rig."""
+    known = np.isfinite(np.column_stack([getattr(window, q) for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)]))
     if len(known) < 2:
-        return np.zeros(known.shape[1])
-    block = ((window.t - window.t[0]) / span + 1e-6).astype(int)
-    begins = [0, *(np.flatnonzero(block[1:] != block[:-1]) + 1)]
-    share: Array = np.logical_or.reduceat(known, begins).sum(0) / (block[-1] + 1)
-    return share
+        return [math.inf] * known.shape[1]
+    number = ((window.t - window.t[0]) / block + 1e-6).astype(int)
+    heard = np.logical_or.reduceat(known, np.flatnonzero(np.diff(number, prepend=-1)))
+    silent: list[float] = (block * (number[-1] + 1 - heard.sum(axis=0))).tolist()
+    return silent

@@ -36,19 +36,7 @@ SLIP_STEP = 1e-4
 def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
     """Return each quantity without noise at the times t [s] (N,): SI, (W, N) of wheels, (N,) of the vehicle.
 
-    Parameters
-    ----------
-    config : Config
-        Vehicle, prior, effects, length of a window.
-    rig : Rig
-        Its wheels; those that are not driven roll.
-    t : Array
-        Times [s].
-
-    Raises
-    ------
-    ValueError
-        The configuration has no vehicle, or no wheel of which a torque is measured.
+    Wheels that are not driven roll.  ValueError where there is no vehicle, or no wheel of which a torque is measured.
     """
     if rig.chassis is None or not rig.wheels:
         raise ValueError("a drive needs a [vehicle] with wheels whose torque is measured")

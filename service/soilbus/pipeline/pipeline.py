@@ -22,21 +22,11 @@ if TYPE_CHECKING:
 
 
 class Pipeline:
-    """Intake and estimator of one vehicle.
+    """Intake and estimator of one vehicle; ConfigError where configuration and the bus's messages do not fit.
 
     Feed frames in the order of their stamps, call `advance` with the present time (or `finish` at the end of a log)
     and take the results of the windows that have ended.  A live service may call `intake.due` instead and run
     `estimator.solve_unwatched` in a worker.
-
-    Parameters
-    ----------
-    config, database
-        The configuration and the messages of the vehicle's bus.
-
-    Raises
-    ------
-    ConfigError
-        Where configuration and database do not fit.
     """
 
     def __init__(self, config: Config, database: Database) -> None:

@@ -30,15 +30,11 @@ class Position(NamedTuple):
 class PositionTrack:
     """The recent fixes; latitude and longitude may come in different frames.
 
-    Parameters
-    ----------
-    timeout
-        [s], longest gap between two fixes, by channel name; empty where no position is mapped.
-    smoothing
-        Time [s] before and after, within which fixes are averaged.
+    timeout: longest gap [s] between two fixes, by channel name, empty where no position is mapped; smoothing: time [s]
+    before and after, within which fixes are averaged.
     """
 
-    def __init__(self, timeout: Mapping[str, float], smoothing: float = RECEPTION.fix_smoothing) -> None:
+    def __init__(self, timeout: Mapping[str, float], smoothing: float = RECEPTION.timeout) -> None:
         self._timeout, self._smoothing = dict(timeout), smoothing
         self.forget()
 

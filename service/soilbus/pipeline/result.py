@@ -46,59 +46,38 @@ class SoilChange(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WindowResult:
-    """Result of one window.
+    """Result of one window; None where nothing is known.
 
     Attributes
     ----------
-    t, index
-        End [s], and number of the window since the start.
-    status, reason
-        Whether the estimate may be used, and why not.
-    posterior, bearing
-        Of the soil, and its bearing pressure [Pa]; None where status is invalid.
-    slip, sinkage
-        Means over the window by wheel, sinkage in m; None where not known.
-    traversability
-        The decision.
-    chi2, samples, rejected
-        Reduced chi-square, number of samples, refused samples by reason.
-    iterations, termination
-        Evaluations of the model by the solver, and why it ended (`solver.Termination`); None without a fit.
-    soil_class
-        Probability of each known soil and of `unknown`, the largest first.
+    t, index, log
+        End [s], number of the window since the start, name of the recording (None for the live bus).
+    status, reason, failure
+        Whether the estimate may be used, why not, and the kind of failure of a solve.
+    posterior, bearing, soil_class
+        Of the soil, its bearing pressure [Pa], and the probability of each known soil and of `unknown`, the largest
+        first; None where status is invalid.
+    slip, sinkage, z_driven
+        Means over the window by wheel, sinkage in m; 5 % and 95 % quantiles of the sinkage [m].
+    traversability, basis, watch, warnings
+        The decision and the data that it rests on; immobilisation warning (unknown where the live loop computes it ten
+        times a second), and when it began.
+    chi2, samples, rejected, channel_chi2
+        Reduced chi-square, number of samples, refused samples by reason; chi-square of every channel over minutes.
+    iterations, termination, search_ended
+        Evaluations of the model by the solver, why it ended (`solver.Termination`), and whether the budget of
+        evaluations (estimator.search_rate, search_burst) ended the search for a soil.
     position
         In the middle of the data used: of the window, or of its part on a new soil.
-    failure
-        Kind of failure of the solve; None for none.
-    gaps
-        Channels that the model has predicted badly for minutes, with their `prediction_error`, the worst first.
-    prediction_error
-        By channel, how far off the model predicts new data, as a share of their size (`estimation.prediction`).
-    standing
+    prediction_error, gaps
+        By channel, how far off the model predicts new data, as a share of their size (`estimation.prediction`); of
+        channels that it has predicted badly for minutes, the worst first.
+    standing, noise_factors
         Standing parts of the model (`estimation.standing`): relaxation length [m], inertia of a mean wheel [kg m^2],
-        lateness of channels beside torque and wheel speed [s].
-    noise_factors
-        By kind of sensor, its sd as the drive shows it over the configured one.
-    channel_chi2
-        Reduced chi-square of every channel over the last minutes.
-    z_driven
-        5 % and 95 % quantiles of the sinkage [m].
-    search_ended
-        The budget of evaluations (estimator.search_rate, search_burst) ended the search for a soil.
-    watch
-        Immobilisation warning; unknown where the live loop computes it ten times a second.
-    warnings
-        When the warning began, ten times a second.
-    log
-        Name of the recording; None for the live bus.
-    soil_change
-        Which soil the window is of, and why.
-    excitation
-        How much draft and slip varied.
-    basis
-        The data that the decision rests on.
-    shows_strength
-        Whether tan phi is known to `estimator.max_tan_phi_std`.
+        lateness of channels beside torque and wheel speed [s]; sd of each kind of sensor over the configured one.
+    soil_change, excitation, shows_strength
+        Which soil the window is of, and why; how much draft and slip varied; whether tan phi is known to
+        `estimator.max_tan_phi_std`.
     corrections
         Of what is read after the window.
     """
@@ -150,18 +129,9 @@ class WindowResult:
 
 
 def as_of(result: WindowResult, watch: Watch, now: float, config: Config) -> WindowResult:
-    """Return the result as it stands at a later time.
+    """Return the result as it stands at the time `now` [s] of the data, when the watch says this.
 
-    Parameters
-    ----------
-    result
-        Of a window that has ended.
-    watch
-        As of now; a stuck vehicle has no valid result.
-    now
-        [s], the time of the data.
-    config
-        Limits of age and distance.
+    A stuck vehicle has no valid result.
     """
     decision = at_present(result.traversability, result.basis, watch, now, config)
     if watch.stuck and result.status is Status.VALID:

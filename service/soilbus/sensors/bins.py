@@ -4,12 +4,13 @@
     variance = noise / (n w),  w = 1 / (1 + d^2 / 2)     n: samples, d: shift in bins, w: worth of a sample
 
 Sums and counts are kept by bin and channel.  Each sample is added once, however many windows contain it.  A bin without
-a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins (`_bridged`).
+a sample is nan, unless it lies between samples of a channel of the vehicle that is slower than the bins (`_bridge`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +25,7 @@ class Bins:
     """Sums and counts of samples by bin and channel, over a sliding span of time.
 
     Outliers (see `outliers`) are left out.  One found among the last four samples of its channel is tested again when
-    later samples are known.
-
-    Parameters
-    ----------
-    rig
-        Its channels and their noise.
-    bin_length
-        [s].
-    origin
-        [s], where the first bin begins.
-    options
-        Of the outlier test, and of `rates.resolved_window`.
+    later samples are known.  Bins have the length `bin_length` [s]; the first begins at `origin` [s].
     """
 
     def __init__(self, rig: Rig, bin_length: float, origin: float, options: ReceptionOptions = RECEPTION) -> None:
@@ -64,30 +54,24 @@ class Bins:
         low, high = self._span(start, end)
         samples, outlier, later = outlier_test(self._taken(high), self._noise.sd, self.options)
         new = ~samples.settled
-        self._totals = self._with(self._totals, samples.pick(new & ~outlier), high)
+        self._count(samples.pick(new & ~outlier), high)
         again = new & outlier & (later < SIDE)
         if outlier.any():
             self._outliers.append(samples.t[new & outlier & ~again] + self.origin)
-        settled = samples._replace(settled=~again)
-        self._recent.append(settled.pick(later < 2 * SIDE))
-        return self._made(self._totals, low, high)
+        self._recent.append(samples._replace(settled=~again).pick(later < 2 * SIDE))
+        return self._made(low, high)
 
     def glimpse(self, start: float, end: float) -> Window:
         """Return the same as `window` without changing the state."""
-        low, high = self._span(start, end)
-        recent = list(self._recent)
-        samples = self._taken(high)
-        self._recent = recent
-        samples, outlier, _ = outlier_test(samples, self._noise.sd, self.options)
-        totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | outlier)), high)
-        return self._made(totals, low, high)
+        other = copy(self)
+        other._totals, other._outliers = self._totals.copy(), []
+        other._recent = [joined(self._recent)]
+        return other.window(start, end)
 
     def screened(self, end: float) -> Samples:
         """Return the samples before `end` [s] without outliers, times [s] from `origin`; keep the state."""
-        recent = list(self._recent)
-        high = round((end - self.origin) / self.bin_length)
-        samples, outlier, _ = outlier_test(self._taken(high), self._noise.sd, self.options)
-        self._recent = recent
+        other = copy(self)
+        samples, outlier, _ = outlier_test(other._taken(other._span(end, end)[1]), self._noise.sd, self.options)
         return samples.pick(~outlier)
 
     def new_outliers(self) -> Array:
@@ -115,37 +99,30 @@ class Bins:
         """Take the recent samples before bin `high` out of the store; those before the span are dropped."""
         recent = joined(self._recent)
         bins = self._bins(recent)
-        self._recent = []
-        if len(bins) and not (bins.min() >= 0 and bins.max() < high):
-            self._recent = [recent.pick(bins >= high)]
-            recent = recent.pick((bins >= 0) & (bins < high))
-        return recent
+        self._recent = [recent.pick(bins >= high)]
+        return recent.pick((bins >= 0) & (bins < high))
 
-    def _with(self, totals: Array, samples: Samples, high: int) -> Array:
-        """Totals with these samples added, at least up to the bin `high`; changed in place if long enough."""
-        short = high - totals.shape[1]
+    def _count(self, samples: Samples, high: int) -> None:
+        """Add samples to the totals, which reach at least up to the bin `high` afterwards."""
+        short, width = high - self._totals.shape[1], self._totals.shape[2]
         if short > 0:
-            totals = np.concatenate([totals, np.zeros((3, max(short, 64), totals.shape[2]))], axis=1)
+            self._totals = np.concatenate([self._totals, np.zeros((3, max(short, 64), width))], axis=1)
         if not len(samples.t):
-            return totals
+            return
         bins = self._bins(samples)
         low = int(bins.min())
-        shape = high - low, totals.shape[2]
-        place = (bins - low) * shape[1] + samples.column
-        for total, weights in zip(totals, (None, samples.value, samples.t), strict=True):
-            total[low:high] += np.bincount(place, weights, shape[0] * shape[1]).reshape(shape)
-        return totals
+        place = (bins - low) * width + samples.column
+        for total, weights in zip(self._totals, (None, samples.value, samples.t), strict=True):
+            total[low:high] += np.bincount(place, weights, (high - low) * width).reshape(-1, width)
 
-    def _made(self, totals: Array, low: int, high: int) -> Window:
-        count, total, time = totals[:, low:high]
+    def _made(self, low: int, high: int) -> Window:
+        count, total, time = self._totals[:, low:high]
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, since = total / count, time / count
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
         of_vehicle = slice(len(WHEEL_QUANTITIES) * self._noise.n_wheels, None)
         samples, count = int(count.sum()), count.copy()
-        bridged = _bridged(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
-        for table, columns in zip((mean, since, count), bridged, strict=True):
-            table[:, of_vehicle] = columns
+        _bridge(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
         mean, worth = _at_centres(mean, since, centre)
         return made_window(self._noise, self.origin + centre, mean, count * worth, samples)
 
@@ -159,8 +136,8 @@ def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Ar
         return np.asarray(np.bincount(place[inside], value[inside], minlength=n) / count)
 
 
-def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Array, Array, Array]:
-    """Mean, mean time [s] and count (N, channels) with the bins between samples of slower channels filled by lines.
+def _bridge(mean: Array, since: Array, count: Array, centre: Array) -> None:
+    """Fill the bins between samples of slower channels by lines: mean, mean time [s], count (N, channels), in place.
 
     The samples are shared among the bins: n samples are worth no more than n.  For channels of the vehicle only, whose
     mass lets them change slowly: what a wheel does swings with its load at 1.5 to 3 Hz.  One lost sample doubles the
@@ -168,11 +145,7 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
     """
     filled = count > 0.0
     n_filled = filled.sum(0)
-    slow = np.flatnonzero((n_filled > 2) & (n_filled < len(filled)))
-    if not len(slow):
-        return mean, since, count
-    mean, since, per_bin = mean.copy(), since.copy(), count.copy()
-    for channel in slow:
+    for channel in np.flatnonzero((n_filled > 2) & (n_filled < len(filled))):
         at = np.flatnonzero(filled[:, channel])
         step = np.diff(at)
         usual = np.median(step)
@@ -182,8 +155,7 @@ def _bridged(mean: Array, since: Array, count: Array, centre: Array) -> tuple[Ar
         between = np.concatenate([np.arange(i + 1, i + n) for i, n in zip(at, step, strict=False)])
         mean[between, channel] = np.interp(centre[between], since[at, channel], mean[at, channel])
         since[between, channel] = centre[between]
-        per_bin[np.concatenate([at, between]), channel] = count[:, channel].sum() / (len(at) + len(between))
-    return mean, since, per_bin
+        count[np.concatenate([at, between]), channel] = count[:, channel].sum() / (len(at) + len(between))
 
 
 def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:
@@ -194,14 +166,11 @@ def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]
     """
     if len(mean) < 3:
         return mean, np.ones(mean.shape)
-    slope = np.full(mean.shape, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         step = (mean[1:] - mean[:-1]) / (since[1:] - since[:-1])
-        slope[1:-1] = (mean[2:] - mean[:-2]) / (since[2:] - since[:-2])
-    slope[0], slope[-1] = step[0], step[-1]
-    slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[:-1])
-    slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[1:])
-    away = np.where(np.isfinite(slope), centre[:, None] - since, 0.0)
-    return mean + np.where(np.isfinite(slope), slope, 0.0) * away, 1.0 / (
-        1.0 + (away / (centre[1] - centre[0])) ** 2 / 2.0
-    )
+        slope = np.concatenate([step[:1], (mean[2:] - mean[:-2]) / (since[2:] - since[:-2]), step[-1:]])
+    for aside in (step[:-1], step[1:]):
+        slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], aside)
+    known = np.isfinite(slope)
+    away = np.where(known, centre[:, None] - since, 0.0)
+    return mean + np.where(known, slope, 0.0) * away, 1.0 / (1.0 + (away / (centre[1] - centre[0])) ** 2 / 2.0)

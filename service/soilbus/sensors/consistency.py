@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,7 +40,6 @@ from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
 SAME = 1e-12
 """Relative difference of means of equal readings: rounding."""
-MOTOR_SPEED = "motor_speed"
 
 
 class Resolution(NamedTuple):
@@ -54,10 +52,9 @@ class Resolution(NamedTuple):
 class ConsistencyInput(NamedTuple):
     """Window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
 
-    window has values of every wheel (`instrumentation.completed`), raw the channels alone.
-
-    traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
-    does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
+    window has values of every wheel (`instrumentation.completed`), raw the channels alone.  traction is torque over
+    load and radius; slip is nan unless the vehicle drives straight on.  motor_speed [rad/s] (N, W) is at the wheel's
+    side of the gear.
     """
 
     window: Window
@@ -74,7 +71,7 @@ class ConsistencyInput(NamedTuple):
     @property
     def sustained(self) -> int:
         """Bins for which a contradiction must last, and over which changes are compared."""
-        return max(round(self.options.contradiction_time / self.bin), 1)
+        return max(round(self.options.comparison_time / 3.0 / self.bin), 1)
 
     @property
     def compared(self) -> int:
@@ -87,26 +84,19 @@ class SensorConsistency:
 
     def __init__(self, rig: Rig, channels: Iterable[Channel], database: Database, settings: Estimator) -> None:
         self._rig, self._settings = rig, settings
-        listed = tuple(channels)
-        self._resolution = {c.name: resolution_of(c, database) for c in listed}
-        self._motors = [w for w in rig.wheels if any(c.name == f"{MOTOR_SPEED}.{w}" for c in listed)]
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget the speeds of the motors."""
-        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in self._motors}
+        self._resolution = {c.name: resolution_of(c, database) for c in channels}
+        motors = [wheel for wheel in rig.wheels if f"motor_speed.{wheel}" in self._resolution]
+        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in motors}
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
         """Keep the motors' speeds among these samples (t [s], value in SI; both (N,)) by channel."""
         for wheel, heard in self._heard.items():
-            if found := samples.get(f"{MOTOR_SPEED}.{wheel}"):
+            if found := samples.get(f"motor_speed.{wheel}"):
                 heard.append(found)
 
     def checked(self, window: Window) -> tuple[Window, tuple[str, ...]]:
         """Return a forward window without the channels that contradict the others, and which these are."""
-        s = self._settings
-        motor = self._motor_speed(window)
-        names = implausible(window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, motor)
+        names = implausible(window, self._rig, self._settings, self._resolution, self._motor_speed(window))
         return without(window, self._rig, set(names)), names
 
     def drop_before(self, t: float) -> None:
@@ -116,7 +106,7 @@ class SensorConsistency:
 
     def _motor_speed(self, window: Window) -> Array | None:
         """Mean speeds [rad/s] of the motors in the window's bins (N, W), forward; nan where unknown."""
-        if not self._motors or not len(window.t):
+        if not self._heard or not len(window.t):
             return None
         n = len(window.t)
         speed = np.full((n, len(self._rig.wheels)), np.nan)
@@ -130,7 +120,7 @@ class SensorConsistency:
 
 
 def resolution_of(channel: Channel, database: Database) -> Resolution:
-    """Return the step of a channel's signal in SI, and whether zero is the end of its range."""
+    """Return the resolution of a channel by its signal; zero is what rests where its range ends there."""
     signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
     step = 0.0 if signal.conversion.is_float else abs(channel.factor * float(signal.scale))
     ends = (signal.minimum, signal.maximum)
@@ -141,27 +131,24 @@ def resolution_of(channel: Channel, database: Database) -> Resolution:
 def implausible(
     window: Window,
     rig: Rig,
-    min_speed: float,
-    max_turn: float,
-    bin_length: float,
+    settings: Estimator,
     resolution: Mapping[str, Resolution],
     motor_speed: Array | None = None,
     options: ConsistencyOptions = CONSISTENCY,
 ) -> tuple[str, ...]:
     """Return the channels of a forward window that contradict the others, in the order of rig.channels.
 
-    min_speed [m/s] and max_turn as the estimator's gates; resolution by channel name;
-    motor_speed [rad/s] (N, W), nan where unknown, may be named as "motor_speed.FL".
+    resolution: by channel name; motor_speed: [rad/s] (N, W), nan where unknown, named as "motor_speed.FL".
     """
 
     def seen(raw: Window, motor: Array) -> ConsistencyInput:
         window = completed(raw, rig)
-        driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
+        driving = (window.ground_speed > settings.min_speed) & ~turning(window, rig, settings.max_turn)
         ground = np.where(driving, window.ground_speed, np.nan)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
         slip = slip_ratio(rig.radius, window.speed, ground)
-        return ConsistencyInput(window, raw, rig, bin_length, driving, slip, traction, motor, resolution, options)
+        return ConsistencyInput(window, raw, rig, settings.bin, driving, slip, traction, motor, resolution, options)
 
     motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
     data = seen(window, motor)
@@ -205,8 +192,7 @@ def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
 
 def frozen(data: ConsistencyInput) -> Iterator[str]:
     """Yield channels that read the very same for longer than their noise allows, while the vehicle drives."""
-    options = data.options
-    window, rig = data.raw, data.rig
+    window, rig, rare = data.raw, data.rig, 1.0 - data.options.usual_share
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
     value = np.column_stack([getattr(window, q) for q in quantities])
     with np.errstate(invalid="ignore"):
@@ -216,14 +202,14 @@ def frozen(data: ConsistencyInput) -> Iterator[str]:
     if not often:
         return
     variance = np.column_stack([window.variance[q] for q in quantities])
+    chance = math.erfc(data.options.significant_sd / math.sqrt(2.0))
     for i in often:
         name = rig.channels[i]
         noise, resolution = rig.noise[name.partition(".")[0]], data.resolution.get(name, Resolution(0.0, False))
         stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= data.sustained]
         within = sum(last - first for first, last in stretches)
-        if same[:, i].sum() - within > options.repeated_share * (np.isfinite(value[:, i]).sum() - within):
-            continue
-        chance = math.erfc(options.significant_sd / math.sqrt(2.0))
+        if same[:, i].sum() - within > rare * (np.isfinite(value[:, i]).sum() - within):
+            continue  # a sensor coarser than its signal
         if any(_stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution, chance) for a, b in stretches):
             yield name
 
@@ -246,13 +232,10 @@ def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolu
 
 def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
     """Yield the speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed if all rest."""
-    options = data.options
-    window, rig = data.window, data.rig
-    ground = window.ground_speed[:, None]
+    window, rig, options = data.window, data.rig, data.options
+    standing = (1.0 - options.usual_share) * window.ground_speed[:, None]
     with np.errstate(invalid="ignore"):
-        still = data.driving[:, None] & (rig.radius * window.speed < options.still_share * ground)
-        if not still.any():
-            return
+        still = data.driving[:, None] & (rig.radius * window.speed < standing)
         braked = data.traction < -options.driving_traction
         idle = np.abs(data.traction) < options.idle_traction
     if lasts(np.logical_and.reduce(still & idle, axis=1), data.sustained):
@@ -268,112 +251,87 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
 
     Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
     """
-    options = data.options
-    window, rig, motor = data.window, data.rig, data.motor_speed
+    window, rig, motor, options = data.window, data.rig, data.motor_speed, data.options
     if not np.isfinite(motor).any():
         return
     with np.errstate(invalid="ignore"):
-        noise = np.sqrt(2.0 * window.variance["speed"])
-        apart = (
-            np.abs(motor - window.speed) > options.gear_slack * np.abs(window.speed) + options.significant_sd * noise
-        )
-    apart &= data.driving[:, None]
+        slack = options.gear_slack * np.abs(window.speed)
+        slack += options.significant_sd * np.sqrt(2.0 * window.variance["speed"])
+        apart = data.driving[:, None] & (np.abs(motor - window.speed) > slack)
     wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], data.sustained)]
     good = [i for i in range(len(rig.wheels)) if i not in wrong]
     for i in wrong:
+        names = [f"speed.{rig.wheels[i]}", f"motor_speed.{rig.wheels[i]}"]
         if len(wrong) > len(good):
-            yield f"speed.{rig.wheels[i]}"
-            yield f"motor_speed.{rig.wheels[i]}"
+            yield from names
             continue
         where = apart[:, i]
         usual = median((rig.radius * window.speed)[where][:, good])
-        of_motor, of_wheel = (abs(median(rig.radius[i] * s[where, i]) - usual) for s in (motor, window.speed))
-        yield f"{'motor_speed' if of_motor > of_wheel else 'speed'}.{rig.wheels[i]}"
+        off = [abs(median(rig.radius[i] * speed[where, i]) - usual) for speed in (window.speed, motor)]
+        yield names[int(off[1] > off[0])]
 
 
 def load_sum(data: ConsistencyInput) -> Iterator[str]:
     """Yield the load that alone explains why the loads do not add up to the weight; all where none can."""
-    options = data.options
-    window, rig, chassis = data.window, data.rig, data.rig.chassis
+    window, rig, chassis, options = data.window, data.rig, data.rig.chassis, data.options
     if chassis is None or set(rig.front.tolist()) != {True, False}:
         return
-    weight = chassis.mass * GRAVITY
     draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
     due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
-    excess = (window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1) - due) / weight
-    total = excess.sum(axis=1)
+    has = window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1)
+    excess = (has - due) / (chassis.mass * GRAVITY)
     with np.errstate(invalid="ignore"):
-        wrong = data.driving & (np.abs(total) > options.load_error)
+        wrong = data.driving & (np.abs(excess.sum(axis=1)) > options.load_error)
     if not lasts(wrong, data.sustained):
         return
     front, rear = np.median(excess[wrong], axis=0)
     if not -options.any_load < front + rear < options.any_load:
         yield from (f"load.{wheel}" for wheel in rig.wheels)
         return
-    if min(abs(front), abs(rear)) > options.load_error:
-        return  # something is carried
-    of_axle = [np.flatnonzero(rig.front), np.flatnonzero(~rig.front)]
-    bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
-    if len(bad) == len(sound) == 2:
-        left, other = (
-            median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
-        )
-        if abs(left - other) > options.load_error:
-            heavier = 0 if left > other else 1
-            yield f"load.{rig.wheels[bad[heavier if front + rear > 0.0 else 1 - heavier]]}"
-
-
-def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
-    """Yield the acceleration where it says that the vehicle slows down whenever it speeds up."""
-    window, lag = data.window, data.sustained
-    gained = change(smooth(window.ground_speed), lag)
-    reported = data.bin * moving_sum(_without_slope(data), lag)
-    noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
-    reported_noise = data.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
-    if _opposite(data, (gained, reported), (noise, reported_noise)):
-        yield "acceleration"
-
-
-def _without_slope(data: ConsistencyInput) -> Array:
-    """dv/dt [m/s^2] (N,) by the accelerometer; nan where it feels a slope that no pitch takes out."""
-    is_known = np.isfinite(data.window.pitch) | (not data.rig.specific_force)
-    return np.where(is_known, data.window.acceleration, np.nan)
+    bad, sound = np.flatnonzero(rig.front), np.flatnonzero(~rig.front)
+    if abs(rear) > abs(front):
+        bad, sound = sound, bad
+    is_carried = min(abs(front), abs(rear)) > options.load_error
+    if is_carried or not len(bad) == len(sound) == 2:
+        return
+    left, other = (
+        median(window.load[wrong][:, pair[0]] / window.load[wrong][:, pair].sum(axis=1)) for pair in (bad, sound)
+    )
+    if abs(left - other) > options.load_error:
+        yield f"load.{rig.wheels[bad[int((left > other) != (front + rear > 0.0))]]}"
 
 
 def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
     """Yield torques or speeds of wheels that slip without driving, or drive without slipping."""
-    options = data.options
-    rig, slip, grip = data.rig, data.slip, data.traction
+    rig, slip, grip, options = data.rig, data.slip, data.traction, data.options
     with np.errstate(invalid="ignore"):
         idle = (slip > options.feigned_slip) & (grip < options.idle_traction)
         dragged = (slip < -options.feigned_slip) & (grip > options.driving_traction)
-    if not (idle.any() or dragged.any()):
-        return
-    idles = [i for i in range(len(rig.wheels)) if lasts(idle[:, i], data.sustained)]
-    drags = [i for i in range(len(rig.wheels)) if lasts(dragged[:, i], data.sustained)]
-    if 2 * len(drags) > len(rig.wheels):
+    wheels = range(len(rig.wheels))
+    idles, drags = ([i for i in wheels if lasts(at[:, i], data.sustained)] for at in (idle, dragged))
+    if 2 * len(drags) > len(wheels):
         yield "ground_speed"
         return
-    if len(idles) == len(rig.wheels) and not _pulls(data, np.logical_and.reduce(idle, axis=1)):
+    if len(idles) == len(wheels) and not _pulls(data, np.asarray(idle.all(axis=1))):
         yield "ground_speed"  # or the torques: coasting at a ground speed that is reported too low looks the same
     yield from (f"torque.{rig.wheels[i]}" for i in idles)
-    others = [i for i in range(len(rig.wheels)) if i not in {*idles, *drags}]
+    others = [i for i in wheels if i not in {*idles, *drags}]
     for i in drags:
         where = dragged[:, i]
-        usual = median(slip[where][:, others])
-        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > options.feigned_slip
+        odd = abs(median(slip[where, i]) - median(slip[where][:, others])) > options.feigned_slip  # nor nan
         yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
 
 
 def wheel_derived_speed(data: ConsistencyInput) -> Iterator[str]:
     """Yield the ground speed where it is the rim speed of pulling wheels: no slip, nor more as they pull more."""
     options, every = data.options, list(range(len(data.rig.wheels)))
+    least = options.slip_per_traction * options.driving_traction
     for wheels in (*data.rig.axles, every):
         slip, grip = data.slip[:, wheels].mean(axis=1), data.traction[:, wheels].mean(axis=1)
         known = np.isfinite(slip) & np.isfinite(grip)
         slip, grip = slip[known], grip[known]
         pulling = grip > options.driving_traction
-        if pulling.sum() < data.compared or median(np.abs(slip[pulling])) >= options.no_slip:
+        if pulling.sum() < data.compared or median(np.abs(slip[pulling])) >= least:
             continue
         r = float(np.corrcoef(grip, slip)[0, 1])
         if r < 0.0 or r**2 * (len(slip) - 2) < options.significant_sd**2 * (1.0 - r**2):  # does not follow it
@@ -385,80 +343,73 @@ def _pulls(data: ConsistencyInput, where: Mask) -> bool:
     """Whether draft, slope and inertia ask the wheels to pull at these instants."""
     chassis = data.rig.chassis
     if chassis is None:
-        return bool(median(data.window.draft[where]) > 0.0)
-    return (
-        median(pull_given(data.window, chassis)[where]) > data.options.driving_traction / 3.0 * chassis.mass * GRAVITY
-    )
+        return median(data.window.draft[where]) > 0.0
+    least = data.options.driving_traction / 3.0 * chassis.mass * GRAVITY
+    return median(pull_given(data.window, chassis)[where]) > least
 
 
-def speed_scale(data: ConsistencyInput) -> Iterator[str]:
-    """Yield ground speed or acceleration, whichever changes several tenths more or less than the other says.
+def scale_of_acceleration(data: ConsistencyInput) -> Iterator[str]:
+    """Yield the acceleration if it falls when speed is gained; it or the ground speed if their changes differ much.
 
-    Where the ground speed jumps it is the one; where the slip would be impossible with the
-    one false it is the other; else it may be either, and both are named.
+    A ground speed that jumps is the one; else both are named unless the slip would be impossible with one of them
+    false.
     """
-    options, window = data.options, data.window
-    lag, n = data.sustained, data.compared
-    gained = change(smooth(window.ground_speed), lag)
-    reported = data.bin * moving_sum(_without_slope(data), lag)
+    window, lag, n = data.window, data.sustained, data.compared
+    smooth = neighbours(np.pad(window.ground_speed, 1, "edge"), 3).mean(axis=-1)
+    gained = np.where(data.driving[lag:], change(smooth, lag), np.nan)
+    is_known = np.isfinite(window.pitch) | (not data.rig.specific_force)
+    reported = data.bin * moving_sum(np.where(is_known, window.acceleration, np.nan), lag)
     if len(reported) < n:
         return
-    scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, lag // 2, options)
-    wrong = np.abs(np.log(scale)) > math.log(options.scale_ratio)  # nor nan
+    scale = _scales(gained, reported, n, lag // 2, data.options)
+    if lasts(scale < 0.0, lag):
+        yield "acceleration"
+        return
+    wrong = np.abs(np.log(np.abs(scale))) > math.log(data.options.scale_ratio)  # nor nan
     if wrong.any() and _jumps(data):
         yield "ground_speed"
         return
-    if not lasts(wrong, data.sustained):
+    if not lasts(wrong, lag):
         return
     within = np.convolve(wrong, np.ones(n)) > 0.0  # in the stretches of n instants that begin there
     factor, seen = median(scale[wrong]), median(data.slip[lag:][within])
-    if not 1.0 - (1.0 - seen) / factor < -options.feigned_slip:
+    if not 1.0 - (1.0 - seen) / factor < -data.options.feigned_slip:
         yield "ground_speed"
-    if not seen < -options.feigned_slip:
+    if not seen < -data.options.feigned_slip:
         yield "acceleration"
 
 
 def _scales(gained: Array, reported: Array, n: int, late: int, options: ConsistencyOptions) -> Array:
     """Ratios of speed gained to acceleration reported (both (M,)) in each n neighbours, (M - n + 1,); nan where unsure.
 
-    Either may be late by up to `late` bins; of the delays with which the two go together the one counts with which they
+    Either may be late by up to `late` bins; of the delays with which they go together the one counts with which they
     are most alike.
     """
     nothing = np.full(late, np.nan)
     moved = neighbours(np.concatenate([nothing, reported, nothing]), len(reported))
     known = np.isfinite(gained) & np.isfinite(moved)
     one, other = np.where(known, gained, 0.0), np.where(known, moved, 0.0)
-    both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(
-        len(reported), n
-    )
+    both, of_one, of_other, count = neighbours(np.stack([one * other, one**2, other**2, known]), n).sum(axis=-1)
     enough = (count >= options.usual_share * n) & (of_one > 0.0) & (of_other > 0.0)
     together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
-    scale = np.divide(both, of_other, where=together > options.correlation, out=np.full(both.shape, np.inf))
-    best = np.argmin(np.abs(np.log(scale)), axis=0)
+    fits = 1.0 - together**2 < options.scatter**2
+    scale = np.divide(both, of_other, where=fits, out=np.full(both.shape, np.inf))
+    best = np.argmin(np.abs(np.log(np.abs(scale))) + np.where(scale < 0.0, np.log(options.scale_ratio), 0.0), axis=0)
     chosen = np.take_along_axis(scale, best[None], axis=0)[0]
     return np.where(np.isfinite(chosen), chosen, np.nan)
 
 
-@lru_cache(maxsize=8)
-def _stretches(length: int, n: int) -> Array:
-    """Matrix (length, length - n + 1) of ones and zeros that sums each n neighbours."""
-    first = np.arange(length - n + 1)
-    place = np.arange(length)[:, None]
-    return np.asarray((place >= first) & (place < first + n), float)
-
-
 def _jumps(data: ConsistencyInput) -> bool:
     """Whether the ground speed changes at once by what no acceleration about that time explains."""
-    options, window = data.options, data.window
-    late = max(data.sustained // 2, 1)
+    window, late = data.window, max(data.sustained // 2, 1)
     lag = max(late // 2, 1)  # a change faster than their delay
     jump = np.abs(change(window.ground_speed, lag))
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag))
     reported = np.abs(data.bin * moving_sum(zero_if_unknown(window.acceleration), lag))
     most = neighbours(np.pad(reported, late), 2 * late + 1).max(axis=1)
     with np.errstate(invalid="ignore"):
-        stands_out = (jump > options.significant_sd * noise) & (most < options.jump_explained * jump)
-        return bool((data.driving[lag:] & stands_out).any())
+        stands_out = (jump > data.options.significant_sd * noise) & (most < data.options.scatter * jump)
+    return bool((data.driving[lag:] & stands_out).any())
 
 
 def draft_sign(data: ConsistencyInput) -> Iterator[str]:
@@ -466,39 +417,22 @@ def draft_sign(data: ConsistencyInput) -> Iterator[str]:
 
     On soft ground it may also pull less when its wheels drive more, for they sink; but it pulls.
     """
-    window, rig, chassis = data.window, data.rig, data.rig.chassis
+    window, rig, chassis, options = data.window, data.rig, data.rig.chassis, data.options
     if chassis is None:
         return
     lag, weight, variance = data.sustained, chassis.mass * GRAVITY, window.variance
+    known = data.driving & np.isfinite(window.pitch) & np.isfinite(window.acceleration)
     thrust = (window.torque / rig.radius).sum(axis=1)
-    driven = change(thrust, lag)
-    noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
-    known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
-    pulled = np.where(known & data.driving, pull_given(window, chassis), np.nan)
-    pull = change(pulled, lag)
+    pulled = np.where(known, pull_given(window, chassis), np.nan)
+    of_thrust = (variance["torque"] / rig.radius**2).sum(axis=1)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
-    pull_noise = np.sqrt(change_variance(of_pull, lag))
-    if median(pulled * thrust) < 0.0 and _opposite(data, (driven, pull), (noise, pull_noise)):
-        yield "draft"
-
-
-def _opposite(data: ConsistencyInput, changes: tuple[Array, Array], noise: tuple[Array, Array]) -> bool:
-    """Whether changes (M,) of two quantities that should go together are opposite for long enough.
-
-    Only instants count at which both stand out of their noise, standard deviations (M,).
-    """
-    options = data.options
+    driven, pull = change(thrust, lag), change(pulled, lag)
     with np.errstate(invalid="ignore"):
-        both = np.logical_and(*(np.abs(c) > options.significant_sd * sd for c, sd in zip(changes, noise, strict=True)))
-    both &= data.driving[len(data.driving) - len(both) :]
-    a, b = (change[both] for change in changes)
-    opposite = running_sum(a * b < 0.0, data.compared)
-    return bool((opposite >= options.usual_share * data.compared).any())
-
-
-def running_sum(values: NDArray[Any], n: int) -> Array:
-    """Return the sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
-    return np.convolve(values, np.ones(n), "valid") if len(values) >= n else np.zeros(0)
+        stands_out = np.abs(driven) > options.significant_sd * np.sqrt(change_variance(of_thrust, lag))
+        stands_out &= np.abs(pull) > options.significant_sd * np.sqrt(change_variance(of_pull, lag))
+    opposite = neighbours((driven * pull)[stands_out] < 0.0, data.compared).sum(axis=-1)
+    if median(pulled * thrust) < 0.0 and (opposite >= options.usual_share * data.compared).any():
+        yield "draft"
 
 
 def change(values: Array, lag: int) -> Array:
@@ -511,23 +445,17 @@ def change_variance(variance: Array, lag: int) -> Array:
     return variance[lag:] + variance[:-lag]
 
 
-def smooth(values: Array) -> Array:
-    """Return the means (N,) of each three neighbours."""
-    wide = np.concatenate([values[:1], values, values[-1:]])
-    return np.asarray((wide[:-2] + wide[1:-1] + wide[2:]) / 3.0)
-
-
 def moving_sum(values: Array, lag: int) -> Array:
     """Return the sums (N - lag,) from each bin's middle to that of the one `lag` later."""
-    return running_sum((values[1:] + values[:-1]) / 2.0, lag)
+    return np.asarray(neighbours((values[1:] + values[:-1]) / 2.0, lag).sum(axis=-1))
 
 
-def neighbours(values: Array, n: int) -> Array:
-    """Return each n neighbours of (N,), (N - n + 1, n).
+def neighbours(values: NDArray[Any], n: int) -> Array:
+    """Return each n neighbours of (..., N), (..., N - n + 1, n); none where there are fewer.
 
     Not numpy's view of them: each call leaves a used place in Python's table of strings, which after hours doubles.
     """
-    return np.asarray(values[np.arange(len(values) - n + 1)[:, None] + np.arange(n)])
+    return np.asarray(values[..., np.arange(values.shape[-1] - n + 1)[:, None] + np.arange(n)])
 
 
 def median(values: Array) -> float:
@@ -538,9 +466,7 @@ def median(values: Array) -> float:
 
 def lasts(holds: Mask, bins: int) -> bool:
     """Return whether something holds in this number of bins in a row."""
-    if np.count_nonzero(holds) < bins:
-        return False
-    return any(last - first >= bins for first, last in runs(holds))
+    return bool(np.count_nonzero(holds) >= bins and neighbours(holds, bins).all(axis=-1).any())
 
 
 def runs(holds: Mask) -> list[tuple[int, int]]:
@@ -550,7 +476,7 @@ def runs(holds: Mask) -> list[tuple[int, int]]:
 
 
 CHECKS: Sequence[Callable[[ConsistencyInput], Iterator[str]]] = (
-    frozen, standing_wheels, gear_ratio, load_sum, acceleration_sign, slip_without_traction, wheel_derived_speed,
-    speed_scale, draft_sign,
+    frozen, standing_wheels, gear_ratio, load_sum, slip_without_traction, wheel_derived_speed,
+    scale_of_acceleration, draft_sign,
 )  # fmt: skip
 """In their order: what one names the next ones do not see."""

@@ -13,7 +13,6 @@ round, tells of a wrong scale.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +20,8 @@ from soilbus.arrays import Array
 from soilbus.estimation.window import forward, pairs, pull_given
 from soilbus.grouping import grouped
 from soilbus.sensors.consistency import change, median, moving_sum
-from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, changes, regression, settled, steps
+from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, changes, fault, regression, settled
+from soilbus.sensors.options import CONSISTENCY
 from soilbus.terra.vehicle import GRAVITY
 
 
@@ -30,22 +30,21 @@ def _wheel_based(facts: Facts) -> Iterator[Finding]:
 
     Means of a second hold no slip that only a late speed makes.
     """
-    second, _ = steps(facts)
+    second = facts.bins(1.0)
     for axle, own in _driven_axles(facts).items():
         carried = median(facts.window.load[:, own].sum(axis=1))
         rows = np.stack([facts.slip[:, own].mean(axis=1), facts.thrust[:, own].sum(axis=1) / carried], axis=1)
-        means = settled(rows, second, 2 * LIMITS.least_seconds * second)
+        means = settled(rows, second, facts.bins(2.0 * LIMITS.least_seconds))
         if means is None:
             continue
         slip, thrust = (means - means.mean(axis=0)).T
         (per_thrust,), (sd,) = regression(slip, thrust[:, None])
-        if thrust.std() > LIMITS.excited and per_thrust + LIMITS.side_sd * sd < LIMITS.least_slip:
-            yield Finding(
+        if thrust.std() > LIMITS.excited and per_thrust + LIMITS.side_sd * sd < CONSISTENCY.slip_per_traction:
+            yield fault(
                 f"signals.ground_speed: goes with the {axle} wheels: hardly any slip comes with their thrust, which"
                 f" moves by {thrust.std() * carried / 1e3:.1f} kN: is it computed from wheels or motor? map a radar's"
                 " or a receiver's speed",
-                True,
-                ("ground_speed",),
+                "ground_speed",
             )
             return
 
@@ -61,74 +60,54 @@ def _driven_axles(facts: Facts) -> dict[str, list[int]]:
     return {axle: [facts.rig.wheels.index(name) for name in names] for axle, names in axles.items() if names}
 
 
-class Felt(NamedTuple):
-    """Parts of an accelerometer's readings, with standard deviations, and the sd of the slope [m/s^2]."""
-
-    of_speed: float
-    of_slope: float
-    speed_sd: float
-    slope_sd: float
-    slope: float
-
-    @property
-    def shows_slope(self) -> bool:
-        """Whether the readings decide if gravity is felt."""
-        return self.slope > GRAVITY * LIMITS.tilted and LIMITS.side_sd * self.slope_sd < 0.5
-
-
-def _changes(facts: Facts) -> Array | None:
+def _felt(facts: Facts) -> Array | None:
     """Changes (N, 3) within 1 s of the accelerometer's integral, ground speed, and g sin(pitch)'s integral [m/s]."""
-    window, (lag, block) = facts.window, steps(facts)
+    window, lag = facts.window, facts.bins(1.0)
     if not {"acceleration", "ground_speed"} <= facts.mapped:
         return None
     slope = GRAVITY * np.sin(window.pitch) if "pitch" in facts.mapped else np.zeros(len(window.t))
     summed = [facts.config.estimator.bin * moving_sum(a, lag) for a in (forward(facts.raw).acceleration, slope)]
     gained = change(np.where(facts.straight, window.ground_speed, np.nan), lag)
-    rows = settled(np.stack([summed[0], gained, summed[1]], axis=1), block)
+    rows = settled(np.stack([summed[0], gained, summed[1]], axis=1), facts.bins(0.5), facts.bins(20.0))
     return None if rows is None else np.asarray(rows - rows.mean(axis=0))  # a constant offset is no scale
 
 
-def _felt(rows: Array) -> Felt:
-    (of_speed, of_slope), (speed_sd, slope_sd) = regression(rows[:, 0], rows[:, 1:])
-    return Felt(float(of_speed), float(of_slope), float(speed_sd), float(slope_sd), float(rows[:, 2].std()))
+def _slope_felt(rows: Array) -> tuple[float, float] | None:
+    """Share of the slope that the accelerometer feels, and what it may be off; None where the slope hardly changes."""
+    (_, share), (_, sd) = regression(rows[:, 0], rows[:, 1:])
+    margin = LIMITS.side_sd * float(sd)
+    return (float(share), margin) if rows[:, 2].std() > GRAVITY * LIMITS.tilted and margin < 0.5 else None
 
 
 def _accelerometer(facts: Facts) -> Iterator[Finding]:
     """Scale and kind of the accelerometer; scale and sign of the pitch that it feels."""
-    rows = _changes(facts)
+    rows = _felt(facts)
     if rows is None:
         return
-    felt, most = _felt(rows), LIMITS.scale[1]
-    (back, _), (back_sd, _) = regression(rows[:, 1], rows[:, [0, 2]])
-    size = felt.of_speed if felt.of_speed - LIMITS.side_sd * felt.speed_sd > most else 0.0
-    if not size and back - LIMITS.side_sd * back_sd > most:
-        size = 1.0 / float(back)
-    if size:
-        yield Finding(
-            f"signals.acceleration: changes {size:.2g} times as much as the ground speed asks: its unit or scale?",
-            True,
-            ("acceleration",),
-        )
+    for factors, sds, power in (
+        (*regression(rows[:, 0], rows[:, 1:]), 1.0),
+        (*regression(rows[:, 1], rows[:, [0, 2]]), -1.0),
+    ):
+        if factors[0] - LIMITS.side_sd * sds[0] > LIMITS.scale[1]:
+            size = f"{factors[0] ** power:.2g} times as much as the ground speed asks"
+            yield fault(f"signals.acceleration: changes {size}: its unit or scale?", "acceleration")
+            return
+    felt, sensor = _slope_felt(rows), facts.config.signals.acceleration
+    if "pitch" not in facts.mapped or sensor is None or felt is None:
         return
-    if "pitch" not in facts.mapped or facts.config.signals.acceleration is None or not felt.shows_slope:
-        return
-    margin, is_force = LIMITS.side_sd * felt.slope_sd, facts.config.signals.acceleration.kind == "specific_force"
-    if felt.of_slope < -margin:
+    (share, margin), is_force = felt, sensor.kind == "specific_force"
+    if share < -margin:
         text = "signals.pitch: the accelerometer feels it the other way: its sign (positive nose up; sign = -1)?"
-        yield Finding(text, True, ("pitch",))
-    elif not is_force and felt.of_slope - margin > 0.5:
+        yield fault(text, "pitch")
+    elif not is_force and share - margin > 0.5:
         text = 'signals.acceleration: feels the slope, which dv/dt does not: kind = "specific_force"?'
-        yield Finding(text, True, ("acceleration",))
-    elif is_force and abs(felt.of_slope) < margin and margin < 0.5:
+        yield fault(text, "acceleration")
+    elif is_force and share < margin:
         text = 'signals.acceleration: does not feel the slope: kind = "kinematic", or scale of signals.pitch?'
-        yield Finding(text, True, ("acceleration",))
-    elif is_force and (felt.of_slope + margin < 0.5 or felt.of_slope - margin > 1.5):
-        yield Finding(
-            f"signals.pitch: the accelerometer feels {felt.of_slope:.2g} times the slope that it shows: its unit or"
-            " scale?",
-            True,
-            ("pitch",),
-        )
+        yield fault(text, "acceleration")
+    elif is_force and (share + margin < 0.5 or share - margin > 1.5):
+        text = f"the accelerometer feels {share:.2g} times the slope that it shows: its unit or scale?"
+        yield fault(f"signals.pitch: {text}", "pitch")
 
 
 def _slope(facts: Facts) -> Iterator[Finding]:
@@ -140,7 +119,8 @@ def _slope(facts: Facts) -> Iterator[Finding]:
     uphill = weight * np.sin(window.pitch)
     x = changes(facts, facts.thrust.sum(axis=1), uphill, pull_given(window, chassis) - uphill)
     if x is None or x[:, 1].std() < LIMITS.excited * weight:
-        if (felt := _changes(facts)) is not None and _felt(felt).shows_slope:
+        rows = _felt(facts)
+        if rows is not None and _slope_felt(rows):
             return  # the accelerometer says it
         kind = " and the kind of signals.acceleration" if "acceleration" in facts.mapped else ""
         raise UndecidableError(
@@ -150,32 +130,26 @@ def _slope(facts: Facts) -> Iterator[Finding]:
     (of_slope, _), (sd, _) = regression(x[:, 0], x[:, 1:])
     if of_slope < -LIMITS.side_sd * sd:
         text = "signals.pitch: the wheels thrust less uphill: its sign (positive nose up; sign = -1)?"
-        yield Finding(text, True, ("pitch",))
+        yield fault(text, "pitch")
 
 
 def _yaw(facts: Facts) -> Iterator[Finding]:
-    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster.
-
-    Where the track is known only speeds that differ by about yaw rate times track are of a turn, and not of a spin.
-    """
+    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster."""
     window, rig = facts.window, facts.rig
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
         return
+    left, right = pairs(rig)
     rims = rig.radius * window.speed
-    apart = np.stack([rims[:, right] - rims[:, left] for left, right in pairs(rig).T.tolist()])
+    sides = np.sign(rims[:, right] - rims[:, left])
     with np.errstate(invalid="ignore"):
-        turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(np.sign(apart).sum(axis=0)) == len(apart))
-        if rig.track is not None:
-            due = np.abs(window.yaw_rate) * rig.track
-            turns &= (np.abs(np.abs(apart) - due) < LIMITS.turn * due).all(axis=0)
-    if turns.sum() * facts.config.estimator.bin < 2.0:
+        turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(sides.sum(axis=1)) == sides.shape[1])
+    if turns.sum() < facts.bins(2.0):
         raise UndecidableError("no turns: the sign of the yaw rate, and which wheels are left, cannot be decided")
-    if median(np.sign(apart[0] * window.yaw_rate)[turns]) < 0.0:
-        yield Finding(
+    if median((sides[:, 0] * np.sign(window.yaw_rate))[turns]) < 0.0:
+        yield fault(
             "signals.yaw_rate: to the left while the left wheels go faster: its sign (positive to the left), or left"
             " and right wheels swapped (the left wheel of an axle comes first)?",
-            True,
-            ("yaw_rate",),
+            "yaw_rate",
         )
 
 
@@ -192,22 +166,18 @@ def _radius_open(facts: Facts) -> Iterator[Finding]:
     chassis = facts.rig.chassis
     if chassis is None:
         return
-    weight = chassis.mass * GRAVITY
-    idle = np.abs(facts.thrust.sum(axis=1)) < LIMITS.rolling * weight
-    idle &= np.abs(pull_given(facts.window, chassis)) < LIMITS.pull * weight
-    if idle.sum() * facts.config.estimator.bin > LIMITS.least_seconds:
-        for i, wheel in enumerate(facts.rig.wheels):
-            slip = median(facts.slip[idle, i])
+    forces = facts.thrust.sum(axis=1), pull_given(facts.window, chassis)
+    idle = np.max(np.abs(forces), axis=0) < LIMITS.rolling * chassis.mass * GRAVITY
+    slips = [(wheel, median(facts.slip[idle, i])) for i, wheel in enumerate(facts.rig.wheels)]
+    if idle.sum() > facts.bins(LIMITS.least_seconds):
+        for wheel, slip in slips:
             if abs(slip) > LIMITS.idle_slip:
                 yield Finding(f"wheel.{wheel}: slips by {slip:.2f} where nothing is pulled: its radius?", False)
         return
-    free = {w.name for w in facts.config.wheel if not w.driven} & set(facts.rig.wheels)
-    rims = [
-        f"{wheel} {1.0 / (1.0 - median(facts.slip[:, i])):.3f}"
-        for i, wheel in enumerate(facts.rig.wheels)
-        if wheel in free
-    ]
-    over = f" (rim over ground speed of free wheels: {', '.join(rims)})" if rims else ""
+    free = [w.name for w in facts.config.wheel if not w.driven and w.name in facts.rig.wheels]
+    usual = {wheel: median(facts.slip[:, facts.rig.wheels.index(wheel)]) for wheel in free}
+    rims = ", ".join(f"{wheel} {1.0 / (1.0 - own):.3f}" for wheel, own in usual.items())
+    over = f" (rim over ground speed of free wheels: {rims})" if rims else ""
     raise UndecidableError(
         f"radius and slip cannot be told apart, 5 % of radius is 0.05 of slip{over}: roll a minute without draft on"
         " firm ground"

@@ -67,13 +67,11 @@ def outlier_test(
     count = np.bincount(column)
     end = np.cumsum(count)
     here = np.arange(n)
-    later = np.repeat(end, count)
-    later -= here + 1
+    later = np.repeat(end, count) - here - 1
     outlier = np.zeros(n, bool)
     if n < SPAN:
         return samples, outlier, later
-    line = np.maximum(here - SIDE, np.repeat(end - count, count))
-    np.minimum(line, np.repeat(np.maximum(end - SPAN, 0), count), out=line)
+    line = np.clip(here - SIDE, np.repeat(end - count, count), np.repeat(np.maximum(end - SPAN, 0), count))
     slope, level, when = _lines(t, value).take(line, axis=1)
     expected = level + slope * (t - when)
     off = np.abs(value - expected)
@@ -82,10 +80,9 @@ def outlier_test(
     far = np.flatnonzero(off > options.outlier_sd * noise)
     far = far[count[column[far]] >= SPAN]
     if len(far):
-        limit = options.quartile_distances * _spread(t, value, line[far], slope[far])
-        scatter = _vibration(value, noise, end - count, end, column[far]) * noise[far]
-        np.maximum(limit, options.outlier_sd * scatter, out=limit)
-        outlier[far] = off[far] > limit
+        spread = options.quartile_distances * _spread(t, value, line[far], slope[far])
+        scatter = options.outlier_sd * _vibration(value, noise, end - count, end, column[far]) * noise[far]
+        outlier[far] = off[far] > np.maximum(spread, scatter)
     return samples, outlier, later
 
 
@@ -94,24 +91,12 @@ def _lines(t: Array, value: Array) -> Array:
 
     They join the medians of both fours (Brown & Mood, 1951).
     """
-    four = np.empty((2, len(t) - SIDE + 1))
-    _median_of_four(value[:-3], value[1:-2], value[2:-1], value[3:], four[0])
-    np.add(t[1:-2], t[2:-1], out=four[1])
-    four[1] *= 0.5
+    fours = np.sort([value[i : len(value) - 3 + i] for i in range(4)], axis=0)
+    four = np.stack([(fours[1] + fours[2]) * 0.5, (t[1:-2] + t[2:-1]) * 0.5])
     before, after = four[:, : -SIDE - 1], four[:, SIDE + 1 :]
-    lines = np.zeros((3, before.shape[1]))
-    np.add(before, after, out=lines[1:])
-    lines[1:] *= 0.5
     rise, run = after - before
-    np.divide(rise, run, out=lines[0], where=run > 0.0)  # not so where the nine are of two channels
-    return lines
-
-
-def _median_of_four(a: Array, b: Array, c: Array, d: Array, out: Array) -> None:
-    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
-    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
-    np.add(low, high, out=out)
-    out *= 0.5
+    slope = np.divide(rise, run, where=run > 0.0, out=np.zeros(len(run)))  # 0 where the nine are of two channels
+    return np.stack([slope, *(before + after) * 0.5])
 
 
 def _spread(t: Array, value: Array, first: NDArray[np.intp], slope: Array) -> Array:

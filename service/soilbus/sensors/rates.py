@@ -44,19 +44,9 @@ class _Channel(NamedTuple):
 
 
 def resolved_window(store: Bins, end: float) -> Window:
-    """Return all samples of a store from its origin to `end`, in bins as short as its spectrum asks for.
+    """Return all samples of a store from its origin to `end` [s], in bins as short as its spectrum asks for.
 
-    Parameters
-    ----------
-    store
-        Samples and configured bin length, which is the longest.
-    end
-        [s].
-
-    Returns
-    -------
-    Window
-        With the channels' curves.
+    The store's bins are the longest.  The window has the channels' curves.
     """
     samples = store.screened(end)
     whole = store.window(store.origin, end)  # which decides what is an outlier

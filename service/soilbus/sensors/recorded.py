@@ -23,12 +23,7 @@ BATCH_SIZE = 5000
 def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns, Counter[tuple[str, Reason]], int]:
     """Return the samples of the longest part with one clock, and refused values and number of frames of all parts.
 
-    Parameters
-    ----------
-    admission
-        Of the channels wanted; it is fed and emptied.
-    frames
-        Of one recording.
+    admission: of the channels wanted, it is fed and emptied; frames: of one recording.
     """
     pieces: list[list[Columns]] = [[]]
     refused: Counter[tuple[str, Reason]] = Counter()
@@ -59,9 +54,10 @@ def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns
 
 
 def _joined(pieces: list[Columns]) -> Columns:
-    names = {name for piece in pieces for name in piece}
-    joined: Columns = {}
-    for name in names:
-        parts = [piece[name] for piece in pieces if name in piece]
-        joined[name] = (np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts]))
-    return joined
+    parts: dict[str, list[tuple[Array, Array]]] = {}
+    for piece in pieces:
+        for name, column in piece.items():
+            parts.setdefault(name, []).append(column)
+    return {
+        name: (np.concatenate([t for t, _ in of]), np.concatenate([v for _, v in of])) for name, of in parts.items()
+    }

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from soilbus.can.role_matching import ASSERTED, WHEELS, Assignment, Candidate, S
 from soilbus.can.units import STANDARD_GRAVITY
 from soilbus.sensors.bins import bin_means
 from soilbus.sensors.consistency import median
-from soilbus.sensors.facts import LIMITS
+from soilbus.sensors.facts import LIMITS, regression
 from soilbus.sensors.recorded import Columns, longest_part
 
 BIN = 0.2
@@ -95,18 +96,14 @@ def recording_of(found: Iterable[Candidate], database: Database, frames: Iterabl
     owner: dict[tuple[int, bool], str] = {}
     for c in found:
         message = database.get_message_by_name(c.message)
-        if owner.setdefault((message.frame_id, message.is_extended_frame), c.message) != c.message:
-            continue
-        try:
-            check_decodable(message, c.signal)
-        except ValueError:
-            continue
-        channels[c.path] = Channel(c.path, "", c.message, c.signal, c.factor, 0.0, -math.inf, math.inf)
+        if owner.setdefault((message.frame_id, message.is_extended_frame), c.message) == c.message:
+            with suppress(ValueError):
+                check_decodable(message, c.signal)
+                channels[c.path] = Channel(c.path, "", c.message, c.signal, c.factor, 0.0, -math.inf, math.inf)
     columns, by_reason, _ = longest_part(Admission(channels.values(), database), frames)
     refused = Counter[str]()
     for (path, reason), n in by_reason.items():
-        if reason != Reason.BAD_TIME:
-            refused[path] += n
+        refused[path] += n * (reason != Reason.BAD_TIME)
     ends = [t for t, _ in columns.values()]
     seconds = max(float(t[-1]) for t in ends) - min(float(t[0]) for t in ends) if ends else 0.0
     return Recording(columns, refused, seconds)
@@ -114,8 +111,7 @@ def recording_of(found: Iterable[Candidate], database: Database, frames: Iterabl
 
 def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]:
     """Return the candidates with what the recording says for or against each."""
-    out = []
-    known = list(found)
+    known, out = list(found), []
     turning = _turning(known, recording)
     for c in known:
         if c.path not in recording.columns:
@@ -145,7 +141,6 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
     moving = np.abs(ground) > MOVING
     if moving.sum() < LEAST_BINS:
         moving = np.ones(len(ground), bool)
-    forward = np.where(np.isfinite(ground), np.sign(ground), 1.0)
     axles = axles_of(assignment)
     wheels = [wheel for pair in axles.values() for wheel in pair]
     speed = {w: read("speed", w) for w in wheels}
@@ -162,20 +157,23 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
         of_wheel = asserted.get(Slot("speed", axles[place][0] if place in axles else place))
         if of_wheel is not None and _scatter(motor[moving], wheel[moving]) < 5.0 * RIGID:
             ratios = facts.gear_ratio if of_wheel.dimension == "rotation" else facts.per_metre
-            _keep(ratios, place, np.abs(motor[moving] / wheel[moving]))
+            ratios[place] = median(np.abs(motor[moving] / wheel[moving]))
+        turning = moving & (wheel != 0.0)
+        radius = median(np.abs(ground[turning] / wheel[turning]))
         own_speed = asserted.get(Slot("speed", place))
-        if own_speed is not None and own_speed.dimension == "rotation":
-            turning = moving & (wheel != 0.0)
-            _keep(facts.radius, place, np.abs(ground[turning] / wheel[turning]))
+        if own_speed is not None and own_speed.dimension == "rotation" and math.isfinite(radius):
+            facts.radius[place] = radius
     of_wheels = {place: ratio for place, ratio in facts.gear_ratio.items() if place in WHEELS}
     if of_wheels and max(of_wheels.values()) < (1.0 + SAME_GEAR) * min(of_wheels.values()):
         # gears of one kind on all wheels: the median is free of each sensor's gain error
         facts.gear_ratio.update(dict.fromkeys(of_wheels, float(np.median([*of_wheels.values()]))))
+    forward = np.where(np.isfinite(ground), np.sign(ground), 1.0)
     for slot, c in asserted.items():
-        if slot.role in ("speed", "motor_speed", "torque"):
-            _sign(facts, c, (read(*slot) * forward)[moving])
-        elif slot.role == "draft":
-            _sign(facts, c, read(*slot)[moving])
+        if slot.role in ("speed", "motor_speed", "torque", "draft"):
+            value = (read(*slot) * (1.0 if slot.role == "draft" else forward))[moving]
+            value = value[np.isfinite(value)]
+            if len(value) >= LEAST_BINS and np.median(np.sign(value)) < 0.0:
+                facts.backward[c.path] = f"{np.mean(value < 0.0):.0%} of the drive"
     return facts
 
 
@@ -184,16 +182,9 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
 
 def _turning(found: Iterable[Candidate], recording: Recording) -> Array:
     """A mean of wheels or motors, whose speed each is divided by its own median (bins,)."""
-    paths = {
-        c.path: None
-        for c in found
-        if c.slot.role in ("speed", "motor_speed")
-        and c.slot.place
-        and c.score >= ASSERTED
-        and c.path in recording.columns
-    }
+    turns = [c for c in found if c.slot.role in ("speed", "motor_speed") and c.slot.place and c.score >= ASSERTED]
     edges = recording.edges
-    parts = [recording.mean(path, edges) for path in paths]
+    parts = [recording.mean(path, edges) for path in dict.fromkeys(c.path for c in turns) if path in recording.columns]
     scaled = [part / size for part in parts if (size := median(np.abs(part))) > 0.0]
     return np.asarray(np.mean(scaled, axis=0)) if scaled else np.full(max(len(edges) - 1, 0), np.nan)
 
@@ -204,18 +195,12 @@ def _as_ground_speed(c: Candidate, recording: Recording, turning: Array) -> Cand
     known = (ground > MOVING) & (np.abs(turning) > 0.1)
     if known.sum() < LEAST_BINS:
         return c
-    scatter = _scatter(ground[known], turning[known])
-    if scatter < RIGID:
-        return c.changed(-MOVES_WITH, "turns with the wheels: no slip in it, or a drive on a road")
     pair = np.stack([ground[known], np.abs(turning[known])])
+    if _scatter(*pair) < RIGID:
+        return c.changed(-MOVES_WITH, "turns with the wheels: no slip in it, or a drive on a road")
     if pair.std(axis=1).all() and float(np.corrcoef(pair)[0, 1]) > 0.5:
         return c.changed(MOVES_WITH, "follows the wheels and slips against them")
     return c
-
-
-def _sign(facts: Facts, c: Candidate, value: Array) -> None:
-    if np.isfinite(value).sum() >= LEAST_BINS and median(np.sign(value)) < 0.0:
-        facts.backward[c.path] = f"{np.mean(value[np.isfinite(value)] < 0.0):.0%} of the drive"
 
 
 def _kind(acceleration: Array, ground: Array, pitch: Array) -> str:
@@ -223,18 +208,17 @@ def _kind(acceleration: Array, ground: Array, pitch: Array) -> str:
     if len(ground) < LEAST_BINS:
         return ""
     width = round(1.0 / BIN)
-    slope = _smooth(pitch, width)
-    rest = _smooth(acceleration, width) - np.gradient(_smooth(ground, width), BIN)
-    known = np.isfinite(slope) & np.isfinite(rest)
-    if known.sum() < LEAST_BINS or slope[known].std() < LIMITS.tilted:
+    force, speed, slope = (np.convolve(a, np.full(width, BIN), "same") for a in (acceleration, ground, np.sin(pitch)))
+    rows = np.stack([force - np.gradient(speed, BIN), STANDARD_GRAVITY * slope], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) < LEAST_BINS or rows[:, 1].std() < STANDARD_GRAVITY * LIMITS.tilted:
         return ""
-    x = STANDARD_GRAVITY * (np.sin(slope[known]) - np.sin(slope[known]).mean())
-    y = rest[known] - rest[known].mean()
-    k = float(x @ y / (x @ x))
-    sd = float(np.sqrt(((y - k * x) ** 2).sum() / (x @ x) / max(len(x) / width - 2.0, 1.0)))
-    if sd > 0.12 or not (-0.35 < k < 1.35) or 0.35 < k < 0.65:
+    rows -= rows.mean(axis=0)
+    (share,), (sd,) = regression(rows[:, 0], rows[:, 1:])
+    sd *= math.sqrt(width)  # as many neighbours share their samples
+    if sd > 0.12 or min(abs(share), abs(share - 1.0)) > 0.35:
         return ""
-    return "specific_force" if k > 0.5 else "kinematic"
+    return "specific_force" if share > 0.5 else "kinematic"
 
 
 def _driven_axle(motor: Array, axles: Mapping[str, Array]) -> str:
@@ -245,21 +229,11 @@ def _driven_axle(motor: Array, axles: Mapping[str, Array]) -> str:
 
 
 def _scatter(one: Array, other: Array) -> float:
-    """Relative sd of the ratio of two speeds, without the widest tenth; inf where hardly known together."""
+    """Relative sd of the ratio of two speeds, by its quantiles; inf where hardly known together."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.abs(one / other)
     ratio = ratio[np.isfinite(ratio) & (ratio > 0.0)]
     if len(ratio) < LEAST_BINS:
         return math.inf
-    middle = float(np.median(ratio))
-    low, high = np.quantile(ratio, [0.16, 0.84])
+    low, middle, high = np.quantile(ratio, [0.16, 0.5, 0.84])
     return float((high - low) / 2.0 / middle)
-
-
-def _keep(into: dict[str, float], place: str, values: Array) -> None:
-    if math.isfinite(value := median(values)):
-        into[place] = value
-
-
-def _smooth(values: Array, width: int) -> Array:
-    return np.convolve(values, np.full(width, 1.0 / width), "same") if len(values) >= width else values

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from cantools.database.can import Database, Message
@@ -23,20 +24,22 @@ from soilbus.can.dbc_files import checked_messages
 from soilbus.can.doubts import MEANING
 from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of, found_signal, si_unit
 from soilbus.can.units import unit_of
-from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal
+from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal, Wheel
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward, turning
 from soilbus.grouping import grouped
 from soilbus.sensors.bins import Bins, bin_means
-from soilbus.sensors.consistency import implausible, resolution_of
-from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError
+from soilbus.sensors.consistency import implausible, resolution_of, runs
+from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, fault
 from soilbus.sensors.motion_checks import MOTION_CHECKS
 from soilbus.sensors.recorded import Columns, longest_part
 from soilbus.sensors.vehicle_checks import VEHICLE_CHECKS
 
 MAX_LISTED = 4
 """Identifiers that one line names."""
+NOTHING: tuple[Array, Array] = np.empty(0), np.empty(0)
+"""Times and values of a signal that was not heard."""
 OTHER_SENDER = "another priority or source address than in the DBC?"
 
 
@@ -57,9 +60,18 @@ class Seen:
         """SI unit of its values; "" of a code."""
         return si_unit(self.channel)
 
+    @property
+    def is_absent(self) -> bool:
+        """Whether no frame held it."""
+        return self.count == 0 and not self.refused
 
-@dataclass(frozen=True, slots=True)
-class Survey:
+    @property
+    def is_optional(self) -> bool:
+        """Whether estimates do without it."""
+        return self.channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
+
+
+class Survey(NamedTuple):
     """Result of a survey: every mapped signal, the findings, and what this recording cannot decide (open)."""
 
     seen: tuple[Seen, ...]
@@ -78,71 +90,49 @@ class Survey:
 
 
 def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Survey:
-    """Compare a recording with a configuration.
+    """Compare the frames of one recording with a configuration and the messages of the vehicle's bus.
 
-    Parameters
-    ----------
-    config, database
-        The configuration and the messages of the vehicle's bus.
-    frames
-        Of one recording: (time [s], identifier, extended, data, remote, error).
-
-    Returns
-    -------
-    Survey
-        Signals, findings, open questions.
-
-    Raises
-    ------
-    ConfigError
-        Where configuration and database do not fit.
+    ConfigError where configuration and database do not fit.
     """
-    with_motors = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
-    mapped = {c.name for c in channels_of(config, database)}
-    try:
+    channels = channels_of(config, database)
+    mapped = {c.name for c in channels}
+    with suppress(ConfigError):  # of a speed that nobody mapped
+        with_motors = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
         channels = channels_of(with_motors, database)
-    except ConfigError:  # of a speed that nobody mapped
-        with_motors, channels = config, channels_of(config, database)
+        config = with_motors
     admission = Admission(channels, database, checked_messages(config, database))
-    longest, refused, n = longest_part(admission, frames)
-    seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
-    absent = list(_absent(seen, database, admission.counts))
+    heard, refused, n = longest_part(admission, frames)
+    seen = tuple(_seen(c, heard, refused) for c in channels if c.name in mapped)
+    findings = list(_absent(seen, database, admission.counts))
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
-        return Survey(seen, (Finding(text, True), *(f for f in absent if OTHER_SENDER in f.text)), ())
-    findings = [
-        *absent,
-        *_of_several_senders(channels, admission.counts),
-        *(f for s in seen for f in _of_one(s, database)),
-    ]
-    findings += [
-        *_stuck_and_jagged(seen, longest, config),
-        *_too_slow_to_measure(longest, config),
-        *_mixed_rates(seen, config),
-    ]
-    facts = _facts(with_motors, mapped, longest, database)
-    open_questions = [f"{s.channel.key}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
+        return Survey(seen, (fault(text), *(f for f in findings if OTHER_SENDER in f.text)), ())
+    findings += _of_several_senders(channels, admission.counts)
+    findings += [finding for s in seen for finding in _of_one(s, database)]
+    findings += _stuck_and_jagged(seen, heard, config)
+    findings += _too_slow_to_measure(heard, config)
+    findings += _mixed_rates(seen, config)
+    questions = [f"{s.channel.key}: not in this recording" for s in seen if s.is_absent and s.is_optional]
+    facts = _facts(config, mapped, heard, database)
     if facts is not None:
-        found, questions = _compared(facts, findings, channels, database)
-        findings += found
-        open_questions += questions
-    return Survey(seen, tuple(findings), tuple(open_questions))
+        questions += _compare(facts, findings, channels, database)
+    return Survey(seen, tuple(findings), tuple(questions))
 
 
 # --- decoding ---
 
 
-def _with_motor_speeds(config: Config, database: Database) -> list[object]:
+def _with_motor_speeds(config: Config, database: Database) -> list[Wheel]:
     """The wheels, with an unmapped motor speed added where the torque's message has exactly one."""
-    wheels: list[object] = []
+    wheels = []
     for wheel in config.wheel:
         if wheel.torque is not None and wheel.motor_speed is None and wheel.torque.at != "wheel":
             name = wheel.torque.signal.partition(".")[0]
-            message = next((m for m in database.messages if m.name == name), None)
-            taken = {getattr(wheel, role).signal for role in ("torque", "speed") if getattr(wheel, role) is not None}
-            turns = [s for s in message.signals if _dimension(s.unit) == "rotation"] if message is not None else []
-            if len(turns) == 1 and f"{name}.{turns[0].name}" not in taken:
-                signal = Signal(signal=f"{name}.{turns[0].name}", sign=wheel.torque.sign)
+            signals = [s for message in database.messages if message.name == name for s in message.signals]
+            turns = [f"{name}.{s.name}" for s in signals if _dimension(s.unit) == "rotation"]
+            mapped = {given.signal for given in (wheel.torque, wheel.speed) if given is not None}
+            if len(turns) == 1 and turns[0] not in mapped:
+                signal = Signal(signal=turns[0], sign=wheel.torque.sign)
                 wheel = wheel.model_copy(update={"motor_speed": signal})
         wheels.append(wheel)
     return wheels
@@ -156,7 +146,7 @@ def _dimension(unit: str | None) -> str:
 
 
 def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
-    t, value = heard.get(channel.name, (np.empty(0), np.empty(0)))
+    t, value = heard.get(channel.name, NOTHING)
     rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 and t[-1] > t[0] else math.nan
     low, middle, high = np.quantile(value, [0.0, 0.5, 1.0]).tolist() if len(value) else [math.nan] * 3
     why = {reason: n for (name, reason), n in refused.items() if name == channel.name}
@@ -165,45 +155,30 @@ def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason],
 
 def _facts(config: Config, mapped: Iterable[str], heard: Columns, database: Database) -> Facts | None:
     """The recording in bins; None where no wheel is measured or nothing was heard of the rig."""
-    rig, bin_length = rig_of(config), config.estimator.bin
+    rig, settings = rig_of(config), config.estimator
     known = {name: column for name, column in heard.items() if name in set(rig.channels)}
     if not rig.wheels or not known:
         return None
-    start = min(float(t[0]) for t, _ in known.values())
-    end = max(float(t[-1]) for t, _ in known.values())
-    store = Bins(rig, bin_length, start)
+    start, end = min(float(t[0]) for t, _ in known.values()), max(float(t[-1]) for t, _ in known.values())
+    store = Bins(rig, settings.bin, start)
     store.add(known)
     raw = store.window(start, end)
     if not len(raw.t):
         return None
-    window = completed(forward(raw), rig)
-    motor = np.full(raw.speed.shape, np.nan)
-    for i, wheel in enumerate(rig.wheels):
-        if f"motor_speed.{wheel}" in heard:
-            motor[:, i] = bin_means(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
-    of_axles: dict[str, tuple[Array, Array]] = {
-        a.name: heard[f"speed.{a.name}"] for a in config.axle if f"speed.{a.name}" in heard
-    }
-    shaft = {name: bin_means(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
-    moving = np.abs(window.ground_speed) > config.estimator.min_speed
-    straight = moving & ~turning(window, rig, config.estimator.max_turn)
-    by_radius = frozenset(
-        w.name
-        for w in config.wheel
-        if w.speed is not None and _dimension(found_signal(database, w.speed.signal)[1].unit) == "speed"
-    )
+    window, n = completed(forward(raw), rig), len(raw.t)
+
+    def binned(name: str) -> Array:
+        return bin_means(*heard.get(name, NOTHING), start, settings.bin, n)
+
+    motor = np.stack([binned(f"motor_speed.{wheel}") for wheel in rig.wheels], axis=1)
+    shaft = {a.name: binned(f"speed.{a.name}") for a in config.axle if f"speed.{a.name}" in heard}
+    straight = (np.abs(window.ground_speed) > settings.min_speed) & ~turning(window, rig, settings.max_turn)
+    speeds = {w.name: found_signal(database, w.speed.signal)[1].unit for w in config.wheel if w.speed is not None}
+    by_radius = frozenset(wheel for wheel, unit in speeds.items() if _dimension(unit) == "speed")
     return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped), by_radius)
 
 
 # --- one signal by itself ---
-
-
-def _is_absent(seen: Seen) -> bool:
-    return seen.count == 0 and not seen.refused
-
-
-def _is_optional(seen: Seen) -> bool:
-    return seen.channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
 
 
 _REFUSAL: Mapping[Reason, str] = {
@@ -224,21 +199,19 @@ _REFUSAL: Mapping[Reason, str] = {
 
 def _absent(seen: Iterable[Seen], database: Database, counts: Counts) -> Iterator[Finding]:
     """Messages without which nothing can be estimated, and that never came."""
-    missing = [s.channel for s in seen if _is_absent(s) and not _is_optional(s)]
+    missing = [s.channel for s in seen if s.is_absent and not s.is_optional]
     for name, channels in grouped(missing, lambda channel: channel.message).items():
         message = database.get_message_by_name(name)
         where = f"{'29' if message.is_extended_frame else '11'}-bit identifier {message.frame_id:#x}"
         keys = ", ".join(channel.key for channel in channels)
         text = f"{keys}: no frame of {name} ({where}) was heard"
         if heard := counts.unknown_of_group(message.frame_id) if message.is_extended_frame else []:
-            shown = ", ".join(f"{identifier:#x}" for identifier in heard[:MAX_LISTED]) + ", ..." * (
-                len(heard) > MAX_LISTED
-            )
-            text += f", but {shown} of its parameter group: {OTHER_SENDER}"
+            shown = [f"{identifier:#x}" for identifier in heard[:MAX_LISTED]] + ["..."] * (len(heard) > MAX_LISTED)
+            text += f", but {', '.join(shown)} of its parameter group: {OTHER_SENDER}"
         signals = dict.fromkeys(channel.signal for channel in channels)
         if counts.received[name] and all(_is_of_a_page(message, signal) for signal in signals):
             text = f"{keys}: {name} was heard, but never the page of its multiplexer that holds {', '.join(signals)}"
-        yield Finding(text, True, tuple(c.name for c in channels))
+        yield fault(text, *(c.name for c in channels))
 
 
 def _is_of_a_page(message: Message, signal: str) -> bool:
@@ -263,7 +236,7 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
     channel, key = seen.channel, seen.channel.key
     message = database.get_message_by_name(channel.message)
     refused = sum(seen.refused.values())
-    if _is_absent(seen):
+    if seen.is_absent:
         return
     share = refused / (refused + seen.count)
     said = {max(seen.refused, key=lambda reason: seen.refused[reason])} if share > LIMITS.refused else set()
@@ -271,19 +244,19 @@ def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
         n, why = seen.refused[reason], _REFUSAL.get(reason, str(reason).replace("_", " "))
         why = why.format(low=channel.low, high=channel.high, unit=seen.unit)
         text = f"{key}: {n} of {refused + seen.count} values of {channel.path} do not count: {why}"
-        yield Finding(text, share > 4.0 * LIMITS.refused, (channel.name,) if share > 4.0 * LIMITS.refused else ())
+        yield fault(text, channel.name) if share > 4.0 * LIMITS.refused else Finding(text, False)
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
         cycle = 0 if _is_of_a_page(message, channel.signal) else message.cycle_time
         due = 1e3 / cycle * (1.0 - share) if cycle else 0.0
         if seen.rate < LIMITS.rate * due:
             yield Finding(f"{key}: {seen.rate:.3g} values a second, where the DBC says {due:.3g}", False)
-        elif seen.rate < LIMITS.least_rate and not _is_optional(seen):
+        elif seen.rate < LIMITS.least_rate and not seen.is_optional:
             yield Finding(f"{key}: only {seen.rate:.3g} values a second; windows need {LIMITS.least_rate:g}", False)
 
 
 def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> Iterator[Finding]:
     """Values that never change while the vehicle drives, and values that jump more than a vehicle can."""
-    ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
+    ground = heard.get("ground_speed", NOTHING)
     moving = ground[0][np.abs(ground[1]) > config.estimator.min_speed]
     drives = float(np.ptp(moving)) if len(moving) else 0.0
     for s in seen:
@@ -299,22 +272,20 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         noise = getattr(config.noise, "speed" if quantity == "motor_speed" else quantity)
         size = float(np.median(np.abs(value)))
         sd = math.sqrt(noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * size**2)
-        jumps = np.abs(np.diff(value))
-        typical = float(np.median(jumps))
-        alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
+        jumps = np.diff(value)
+        typical = float(np.median(np.abs(jumps)))
+        alike = float((jumps**2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
         if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
-            yield Finding(
-                f"{s.channel.key}: jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times"
-                f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.path}"
-                " right in the DBC?",
-                True,
-                (name,),
+            text = (
+                f"jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times its noise: is"
+                f" the byte order (Intel, Motorola) or the start bit of {s.channel.path} right in the DBC?"
             )
+            yield fault(f"{s.channel.key}: {text}", name)
 
 
 def _too_slow_to_measure(heard: Columns, config: Config) -> Iterator[Finding]:
     """A ground speed that reads zero while the wheels turn slowly, and has no value below some speed else."""
-    t, ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
+    t, ground = heard.get("ground_speed", NOTHING)
     speeds = [(*heard[f"speed.{w.name}"], w.radius) for w in config.wheel if f"speed.{w.name}" in heard]
     moves = ground != 0.0
     if not moves.any() or not speeds:
@@ -322,8 +293,7 @@ def _too_slow_to_measure(heard: Columns, config: Config) -> Iterator[Finding]:
     least, settings = float(np.abs(ground[moves]).min()), config.traversability
     rim = np.mean([np.interp(t, at, radius * np.abs(speed)) for at, speed, radius in speeds], axis=0)
     creeps = ~moves & (rim > settings.standstill) & (rim < least)
-    begins, ends = (np.flatnonzero(np.diff(np.pad(creeps.astype(int), 1)) == step) for step in (1, -1))
-    longest = max((float(t[end - 1] - t[begin]) for begin, end in zip(begins, ends, strict=True)), default=0.0)
+    longest = max((float(t[end - 1] - t[begin]) for begin, end in runs(creeps)), default=0.0)
     if least > config.estimator.min_speed and longest > settings.stuck_time:
         enough = math.ceil(20.0 * float(rim[~moves].max())) / 20.0
         yield Finding(
@@ -341,7 +311,7 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
         return
     slow, fast = (by(wheels, key=lambda s: s.rate) for by in (min, max))
     present, length = config.estimator.bin, min(max(1.0 / fast.rate, SHORT_BIN), 0.5 / slow.rate)
-    if slow.rate * present < LIMITS.instant and fast.rate * present >= LIMITS.mean_of and length < present:
+    if slow.rate * present < LIMITS.instant and fast.rate * present >= 2.0 * LIMITS.instant and length < present:
         yield Finding(
             f"{slow.channel.key}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {fast.channel.key}: in"
             f" bins of {present:g} s a mean stands beside a value of one instant, and loads that shake bias the soil;"
@@ -353,46 +323,40 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
 # --- signals compared with each other ---
 
 
-def _compared(
-    facts: Facts, before: Iterable[Finding], channels: Iterable[Channel], database: Database
-) -> tuple[list[Finding], list[str]]:
-    """Findings of all checks, each without the channels that an earlier check has named, and open questions."""
-    facts = facts.less(name for f in before for name in f.channels)
-    if facts.straight.sum() * facts.config.estimator.bin < LIMITS.least_seconds:
-        return [], [
-            f"the vehicle drives straight on for less than {LIMITS.least_seconds:g} s: signs, gear ratio and sides"
-            " cannot be compared"
-        ]
-    findings: list[Finding] = []
+def _compare(facts: Facts, findings: list[Finding], channels: Iterable[Channel], database: Database) -> list[str]:
+    """Add what checks find, each without the channels that an earlier one has named; return open questions."""
+    facts = facts.less(name for f in findings for name in f.channels)
+    if facts.straight.sum() < facts.bins(LIMITS.least_seconds):
+        least = f"{LIMITS.least_seconds:g} s: signs, gear ratio and sides cannot be compared"
+        return [f"the vehicle drives straight on for less than {least}"]
     questions: list[str] = []
     for check in (*VEHICLE_CHECKS, *MOTION_CHECKS):
+        found: list[Finding] = []
         try:
-            found = list(check(facts))
+            found += check(facts)
         except UndecidableError as reason:
-            if not any(f.fatal for f in (*before, *findings)):  # else undecided because of the fault
+            if not any(f.fatal for f in findings):  # else undecided because of the fault
                 questions.append(str(reason))
-            continue
         findings += found
         facts = facts.less(name for f in found for name in f.channels)
-    if not any(f.fatal for f in (*before, *findings)):
+    if not any(f.fatal for f in findings):
         findings += _contradictions(facts, channels, database)
-    return findings, questions
+    return questions
 
 
 def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database) -> Iterator[Finding]:
     """Sensors that contradict the others in many windows, by the checks of `consistency`."""
-    s, rig = facts.config.estimator, facts.rig
-    key = {c.name: c.key for c in channels}
-    resolution = {c.name: resolution_of(c, database) for c in channels}
-    n = max(round(s.window / s.bin), 1)
+    rig, listed = facts.rig, list(channels)
+    resolution = {c.name: resolution_of(c, database) for c in listed}
+    is_mapped = np.array([f"motor_speed.{w}" in facts.mapped for w in rig.wheels])
+    motor = np.where(is_mapped, np.abs(facts.motor), np.nan)
+    n, all_rows = facts.bins(facts.config.estimator.window), np.arange(len(facts.window.t))
+    parts = [all_rows[begin : begin + n] for begin in range(0, max(len(all_rows) - n, 0) + 1, n)]
     named: Counter[str] = Counter()
-    mapped = np.array([f"motor_speed.{w}" in facts.mapped for w in rig.wheels])
-    begins = range(0, max(len(facts.window.t) - n, 0) + 1, n)
-    for begin in begins:
-        rows = np.arange(begin, min(begin + n, len(facts.window.t)))
-        motor = np.where(mapped, np.abs(facts.motor[rows]), np.nan)
-        named.update(implausible(facts.window.rows(rows), rig, s.min_speed, s.max_turn, s.bin, resolution, motor))
+    for rows in parts:
+        named.update(implausible(facts.window.rows(rows), rig, facts.config.estimator, resolution, motor[rows]))
+    keys = {c.name: c.key for c in listed}
     for name, count in named.items():
-        if count > max(LIMITS.windows * len(begins), 1.0):
-            text = f"{key.get(name, name)}: contradicts the other sensors in {count} of {len(begins)} windows"
+        if count > max(LIMITS.windows * len(parts), 1.0):
+            text = f"{keys.get(name, name)}: contradicts the other sensors in {count} of {len(parts)} windows"
             yield Finding(text, False, (name,))
