@@ -1,6 +1,6 @@
 """The formats of logs that people have, each recognised by its content and read as frames with their channels.
 
-    first bytes -> Format(name, frames)         frames(stream) -> batches of (channels, frames)
+    first bytes -> Format(name, frames)         frames(stream) -> (channel, frame) of each
 
 python-can reads ASC, BLF, TRC and MF4; candump (can/candump.py), CSV and BUSMASTER are read here.
 """
@@ -15,7 +15,6 @@ import struct
 import sys
 import traceback
 import zlib
-from base64 import b64decode
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
@@ -27,8 +26,8 @@ from typing import NamedTuple
 
 import can
 
-from soilbus.can.candump import Batch, candump_batches, is_candump, of_message
-from soilbus.can.mcap_frames import frame_batches
+from soilbus.can.candump import Heard, candump_frames, is_candump, of_message
+from soilbus.can.mcap_frames import mcap_frames
 from soilbus.files import LIMITS, text_lines, within_ratio
 
 HEAD = 1 << 13
@@ -44,7 +43,7 @@ class Format(NamedTuple):
     """Name of a format for a user, and the reader of a stream of it, which raises all kinds on a damaged file."""
 
     name: str
-    batches: Callable[[BufferedReader], Iterator[Batch]]
+    frames: Callable[[BufferedReader], Iterator[Heard]]
 
 
 def format_of(head: bytes) -> Format:
@@ -66,13 +65,13 @@ def format_of(head: bytes) -> Format:
     if first.startswith("***BUSMASTER"):
         return Format("BUSMASTER log", lambda stream: busmaster(text_lines(stream)))
     if csv := csv_of_frames(first):
-        return Format(csv.name, lambda stream: _of_csv(csv, text_lines(stream)))
+        return csv
     if first.startswith(";") or _TRC_LINE.match(first):
         return Format("PCAN TRC log", lambda stream: map(of_message, can.TRCReader(text_lines(stream))))  # type: ignore[arg-type]
     if any(map(_ASC_LINE.match, lines)):
         return Format("Vector ASC log", lambda stream: asc(text_lines(stream)))
     if any(map(is_candump, lines)):
-        return Format("candump log", lambda stream: candump_batches(text_lines(stream)))
+        return Format("candump log", lambda stream: candump_frames(text_lines(stream)))
     if "\ufffd" in text:
         raise ValueError("binary data of no known format")
     if columns := [cell for cell in re.split("[,;\t]", first) if cell.strip()][1:]:
@@ -95,7 +94,7 @@ in some languages python-can does not know it and reads no base after it."""
 RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
-def asc(lines: Iterable[str]) -> Iterator[Batch]:
+def asc(lines: Iterable[str]) -> Iterator[Heard]:
     """Yield the frames of a Vector ASC log.
 
     Its stamps count from its begin.  Events between frames do not come from the reader, so stamps that only say how
@@ -110,84 +109,73 @@ def asc(lines: Iterable[str]) -> Iterator[Batch]:
         yield of_message(message, 1)
 
 
-class _Csv(NamedTuple):
-    """Name of a CSV of frames, the columns by which it is recognised, and the frame of a row of all its columns."""
-
-    name: str
-    columns: frozenset[str]
-    frame: Callable[[Mapping[str, str]], tuple[float, int, bool, bytes, int, bool, bool]]
-    """Time [s], identifier, whether extended, data, length, whether remote, whether an error."""
-    wraps: bool = False
-    """Whether the stamps begin again after 32 bits of microseconds."""
-
-
 def _truth(text: str) -> bool:
     return text.lower() in ("1", "true")
 
 
-_ROWS = (
-    _Csv(
-        "SavvyCAN (GVRET) CSV", frozenset({"time stamp", "id", "extended", "len", "d1"}),
-        lambda row: (
-            int(row["time stamp"]) / 1e6, int(row["id"], 16), _truth(row["extended"]),
-            bytes(int(cell, 16) for i in range(1, 65) if (cell := row.get(f"d{i}", ""))), int(row["len"]), False, False,
-        ),
-        wraps=True,
-    ),
-    _Csv(
-        "CANedge CSV", frozenset({"timestampepoch", "id", "ide", "databytes"}),
-        lambda row: (
-            float(row["timestampepoch"]), int(row["id"], 16), _truth(row["ide"]), bytes.fromhex(row["databytes"]),
-            int(row.get("datalength", len(row["databytes"]) // 2)), _truth(row.get("rtr", "0")), False,
-        ),
-    ),
-    _Csv(
-        "CSV of python-can", frozenset({"timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"}),
-        lambda row: (
-            float(row["timestamp"]), int(row["arbitration_id"], 16), _truth(row["extended"]),
-            b64decode(row["data"], validate=True), int(row["dlc"]), _truth(row["remote"]), _truth(row["error"]),
-        ),
-    ),
-)  # fmt: skip
+def _gvret(row: Mapping[str, str]) -> tuple[float, bool, bytes, int, bool]:
+    data = bytes(int(cell, 16) for i in range(1, 65) if (cell := row.get(f"d{i}", "")))
+    return int(row["time stamp"]) / 1e6, _truth(row["extended"]), data, int(row["len"]), False
 
 
-def _names(header: str) -> list[str]:
-    return [cell.strip().lower() for cell in header.replace(";", ",").split(",")]
+def _canedge(row: Mapping[str, str]) -> tuple[float, bool, bytes, int, bool]:
+    data = bytes.fromhex(row["databytes"])
+    length = int(row.get("datalength", len(data)))
+    return float(row["timestampepoch"]), _truth(row["ide"]), data, length, _truth(row.get("rtr", "0"))
 
 
-def csv_of_frames(header: str) -> _Csv | None:
-    """Return the kind of CSV of frames with this first line; None of any other."""
-    return next((csv for csv in _ROWS if csv.columns <= set(_names(header))), None)
+_CSVS = (
+    ("SavvyCAN (GVRET) CSV", {"time stamp", "id", "extended", "len", "d1"}, _gvret),
+    ("CANedge CSV", {"timestampepoch", "id", "ide", "databytes"}, _canedge),
+)
+"""Name, columns by which it is recognised, and what a row says: time [s], extended, data, length, remote."""
+_OF_PYTHON_CAN = ["timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"]
 
 
-def _of_csv(csv: _Csv, lines: Iterable[str]) -> Iterator[Batch]:
-    rows = iter(lines)
-    names = _names(next(line for line in rows if line.strip()))
+def csv_of_frames(header: str) -> Format | None:
+    """Return the format of a CSV of frames with this first line; None of any other."""
+    names = _cells(header.lower())
+    if names == _OF_PYTHON_CAN:
+        return Format("CSV of python-can", lambda stream: map(of_message, can.CSVReader(text_lines(stream))))  # type: ignore[arg-type]
+    for name, columns, said in _CSVS:
+        if columns <= {*names}:
+            return Format(name, lambda stream: _of_csv(said, text_lines(stream)))
+    return None
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.replace(";", ",").split(",")]
+
+
+def _of_csv(
+    said: Callable[[Mapping[str, str]], tuple[float, bool, bytes, int, bool]], lines: Iterable[str]
+) -> Iterator[Heard]:
+    rows = (line for line in lines if line.strip())
+    names = _cells(next(rows).lower())
     late, last = 0.0, float("-inf")
     for line in rows:
-        if not line.strip():
-            continue
-        cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
+        cells = _cells(line)
         if len(cells) > len(names):
             cells = [*cells[: len(names)], *filter(None, cells[len(names) :])]  # a comma at the end of a line
         row = dict(zip(names, cells, strict=len(cells) > len(names)))
         try:
-            t, identifier, extended, data, length, remote, error = csv.frame(row)
+            identifier = int(row["id"], 16)
+            t, extended, data, length, remote = said(row)
         except KeyError as name:
             raise ValueError(f"a line without {name}") from None
-        if csv.wraps and last - t > WRAP / 2e6 and last < WRAP / 1e6:
+        if said is _gvret and last - t > WRAP / 2e6 and last < WRAP / 1e6:
             late += WRAP / 1e6
         last = t
-        if not remote and not error and len(data) != length:
+        if not remote and len(data) != length:
             raise ValueError(f"a frame of {length} bytes has {len(data)}")
         channel = row.get("bus") or row.get("buschannel") or ""
-        yield (channel,), [(t + late, identifier & 0x1FFFFFFF, extended, data, remote, error)]
+        yield channel, (t + late, identifier & 0x1FFFFFFF, extended, data, remote, False)
 
 
 _BUSMASTER_DATE = re.compile(r"\*\*\*START DATE AND TIME (\d+):(\d+):(\d+) ")
 
 
-def busmaster(lines: Iterable[str]) -> Iterator[Batch]:
+def busmaster(lines: Iterable[str]) -> Iterator[Heard]:
     """Yield the frames of a log of BUSMASTER; stamps are the time of the day, or count from its begin.
 
     Raises ValueError where they only say how long after the frame before each came.
@@ -220,8 +208,7 @@ def busmaster(lines: Iterable[str]) -> Iterator[Batch]:
         if not remote and len(content) != n:
             raise ValueError(f"a frame of {n} bytes has {len(content)}")
         number = int(identifier, 16 if identifier.lower().startswith("0x") else base)
-        frame = (t + turn + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
-        yield (channel,), [frame]
+        yield channel, (t + turn + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
 
 
 # --- binary
@@ -292,7 +279,7 @@ def placed_copy(stream: BufferedReader) -> Iterator[Path]:
 _MF4_BLOCK = re.compile(rb"##DZ....(.{8})\0{8}(..)([\0-\xff]).(.{4})(.{8})(.{8})", re.DOTALL)
 
 
-def _mf4(stream: BufferedReader) -> Iterator[Batch]:
+def _mf4(stream: BufferedReader) -> Iterator[Heard]:
     if can.io.mf4.asammdf is None:  # type: ignore[attr-defined]
         raise ModuleNotFoundError("this format needs soilbus[mf4]")
     with placed_copy(stream) as path:
@@ -340,7 +327,7 @@ def check_mf4_blocks(path: Path) -> None:
 _SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages"
 
 
-def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
+def _sqlite(stream: BufferedReader) -> Iterator[Heard]:
     """Frames of python-can's SQLite log; a view, a function or a virtual table in their place is refused."""
     with placed_copy(stream) as path, closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as log:
         log.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LIMITS.line)
@@ -365,7 +352,7 @@ def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
 _BINARY = {
     b"LOGG": Format("BLF log", lambda file: (of_message(m, 1) for m in can.BLFReader(_PlainBlf(file)))),  # type: ignore[arg-type]
     b"MDF     4": Format("MF4 log", _mf4),
-    b"\x89MCAP": Format("MCAP log", frame_batches),
+    b"\x89MCAP": Format("MCAP log", mcap_frames),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
 }
 _NO_FRAMES = {

@@ -1,6 +1,6 @@
 """A log of any format as the frames of one channel, within its limits; its faults in one line.
 
-file -> plain bytes (files.opened) -> batches of its format (log_formats) -> frames of one channel
+file -> plain bytes (files.opened) -> frames of its format (log_formats) -> frames of one channel
 """
 
 from __future__ import annotations
@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from io import BufferedReader
-from itertools import pairwise
+from collections.abc import Collection, Iterator
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from statistics import median
 
-from soilbus.can.candump import Batch, Frame
-from soilbus.can.log_formats import HEAD, Format, format_of
+from soilbus.can.candump import Frame, Heard
+from soilbus.can.log_formats import HEAD, format_of
 from soilbus.files import opened, packing, within_ratio
 from soilbus.words import one_line, shown
 
@@ -75,7 +74,6 @@ class Log:
         self.path, self.wanted, self._demanded = path, channel, demanded
         self.kind, self.chosen, self.span, self._given = "", "", 0.0, 0
         self.channels: Counter[str] = Counter()
-        self._is_awaited = False
 
     @property
     def name(self) -> str:
@@ -144,72 +142,58 @@ class Log:
         with opened(self.path) as stream:
             found = format_of(stream.peek(HEAD))
             self.kind = ", ".join(filter(None, (found.name, packing(stream))))
-            batches = self._counted(found, stream)
-            head: list[Batch] = []
+            heard = self._counted(found.frames(stream))
+            head: list[Heard] = []
             fault: Exception | None = None
             try:
-                for batch in batches:
-                    head.append(batch)
-                    if self.channels.total() >= CHANNEL_SCAN_FRAMES:
-                        break
+                head.extend(islice(heard, CHANNEL_SCAN_FRAMES))
             except Exception as error:  # after the frames before it
                 fault = error
-            _check_stamps([frame[0] for _, frames in head for frame in frames])
+            _check_stamps([frame[0] for _, frame in head])
             self._choose()
-            for batch in head:
-                yield from self._of_channel(batch)
+            for self._given, (channel, frame) in enumerate(chain(head, heard), 1):
+                if self.wanted and channel != self.chosen:
+                    self.chosen = self.chosen or _meant(self.wanted, self.channels) or ""  # it may begin late
+                    if channel != self.chosen and (channel or not frame[5]):
+                        continue
+                yield frame
             if fault is not None:
                 raise fault
-            for batch in batches:
-                yield from self._of_channel(batch)
-        if self._is_awaited:
+        if self.wanted and self.channels and self.chosen not in self.channels:
             raise self._not_in_it()
         if self.wanted and self.chosen != (meant := _meant(self.wanted, self.channels)) and meant is not None:
             raise LogError(
                 f"{self.name}: begins with {self.chosen} alone, but has {meant} too: read it with --channel {meant}"
             )
 
-    def _counted(self, found: Format, stream: BufferedReader) -> Iterator[Batch]:
+    def _counted(self, heard: Iterator[Heard]) -> Iterator[Heard]:
         size = self.path.stat().st_size if self.path.is_file() else math.inf
-        first = math.nan
-        for channels, frames in found.batches(stream):
-            if frames:
-                first = frames[0][0] if math.isnan(first) else first
-                self.span = max(self.span, max(frame[0] for frame in frames) - first)
-            named: Iterable[str] = channels
-            if "" in channels:  # error frames of candump, whose reader keeps no channel
-                named = (channel for channel, frame in zip(channels, frames, strict=True) if channel or not frame[5])
-            self.channels.update(named)
-            within_ratio(size, LEAST_FRAME * self.channels.total())
-            yield channels, frames
+        first = 0.0
+        for n, (channel, frame) in enumerate(heard, 1):
+            if n == 1:
+                first = frame[0]
+            if frame[0] - first > self.span:
+                self.span = frame[0] - first
+            if channel or not frame[5]:  # candump's reader keeps no channel of error frames
+                self.channels[channel] += 1
+            if n % CHANNEL_SCAN_FRAMES == 0:
+                within_ratio(size, LEAST_FRAME * n)
+            yield channel, frame
 
     def _choose(self) -> None:
-        """Choose the channel by the frames read so far."""
+        """Choose the channel by the frames read so far; leave it empty where a demanded one may begin later."""
         if not self.wanted or not self.channels:
             return
         chosen = _meant(self.wanted, self.channels)
         if chosen is None and len(self.channels) == 1 and not (self._demanded and min(self.channels)):
             chosen = min(self.channels)
-        if chosen is None and self._demanded:  # it may begin later
-            self._is_awaited = True
-            return
-        if chosen is None:
+        if chosen is None and not self._demanded:
             raise self._not_in_it()
-        self.chosen = chosen
+        self.chosen = chosen or ""
 
     def _not_in_it(self) -> LogError:
         there = _listed(sorted(self.channels))
         return LogError(f"{self.name}: no frame of {self.wanted}, but of {there}: choose with --channel")
-
-    def _of_channel(self, batch: Batch) -> list[Frame]:
-        channels, frames = batch
-        if self._is_awaited and (meant := _meant(self.wanted, self.channels)) is not None:
-            self.chosen, self._is_awaited = meant, False
-        self._given += len(frames)
-        if not self.wanted or set(channels) <= {self.chosen}:
-            return frames
-        pairs = zip(channels, frames, strict=True)
-        return [frame for channel, frame in pairs if channel == self.chosen or (frame[5] and not channel)]
 
 
 def read_frames(path: Path, channel: str = "") -> Iterator[Frame]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import can
 
-from soilbus.can.candump import Batch, Frame, of_message
+from soilbus.can.candump import Frame, Heard, of_message
 from soilbus.files import LIMITS, within_ratio
 
 _STAMP = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}}}
@@ -56,7 +56,7 @@ def frame_message(channel: str, frame: Frame) -> dict[str, Any]:
     }
 
 
-def frame_batches(stream: BufferedReader) -> Iterator[Batch]:
+def mcap_frames(stream: BufferedReader) -> Iterator[Heard]:
     """Yield the frames of an MCAP log in the order of the file; ValueError where it has none."""
     try:
         from mcap.records import Channel, Message, Schema
