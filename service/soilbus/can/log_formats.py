@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from io import BufferedReader, RawIOBase
 from pathlib import Path
 from shutil import copyfileobj
@@ -139,7 +140,7 @@ def csv_of_frames(header: str) -> Format | None:
         return Format("CSV of python-can", lambda stream: map(of_message, can.CSVReader(text_lines(stream))))  # type: ignore[arg-type]
     for name, columns, said in _CSVS:
         if columns <= {*names}:
-            return Format(name, lambda stream: _of_csv(said, text_lines(stream)))
+            return Format(name, partial(_of_csv, said))
     return None
 
 
@@ -148,9 +149,9 @@ def _cells(line: str) -> list[str]:
 
 
 def _of_csv(
-    said: Callable[[Mapping[str, str]], tuple[float, bool, bytes, int, bool]], lines: Iterable[str]
+    said: Callable[[Mapping[str, str]], tuple[float, bool, bytes, int, bool]], stream: BufferedReader
 ) -> Iterator[Heard]:
-    rows = (line for line in lines if line.strip())
+    rows = (line for line in text_lines(stream) if line.strip())
     names = _cells(next(rows).lower())
     late, last = 0.0, float("-inf")
     for line in rows:
