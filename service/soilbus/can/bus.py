@@ -53,10 +53,7 @@ class BusError(Exception):
 
 
 def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
-    """Return the bus that the section [bus] describes, with kernel filters where it has a kernel.
-
-    Raises BusError with one line.
-    """
+    """Return the bus of the section [bus], with kernel filters where it has a kernel; BusError with one line."""
     try:
         bus = can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
         _prepare(bus)
@@ -78,10 +75,7 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
 
 
 def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[candump.Frame]:
-    """Yield the frames that the bus carries from now on; nothing is sent.
-
-    Raises BusError for a bus that cannot be opened or goes away.
-    """
+    """Yield the frames that the bus carries from now on; BusError where it cannot be opened or goes away."""
     bus = open_bus(settings)
     try:
         end = time.monotonic() + seconds
@@ -111,10 +105,7 @@ def _prepare(bus: can.BusABC) -> None:
 
 
 def ask_for_buffer(own: socket.socket) -> None:
-    """Ask for RECEIVE_BUFFER (socket(7)): an administrator gets all of it, others what net.core.rmem_max allows.
-
-    Raises OSError for a socket that is closed.
-    """
+    """Ask for RECEIVE_BUFFER (socket(7)): an administrator gets all of it, others what net.core.rmem_max allows."""
     own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     with suppress(OSError):  # it takes CAP_NET_ADMIN
         own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
@@ -139,11 +130,10 @@ class BusCounts:
 
 
 class LiveBus:
-    """A bus that may go and come back.
+    """A bus that may go and come back: while it is away `receive` returns nothing and `send` drops.
 
-    Nothing in here blocks longer than asked.  While the bus is away `receive` returns
-    nothing and `send` drops.  `clock` is monotonic.  `own` are the identifiers that we send
-    (with: is it extended); a data frame that comes with one of them is somebody else's and is not handed on.
+    Nothing blocks longer than asked.  `clock` is monotonic.  `own` are the identifiers that we send (with: is it
+    extended); a data frame that comes with one of them is somebody else's and is not handed on.
     """
 
     def __init__(
