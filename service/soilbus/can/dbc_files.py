@@ -32,9 +32,7 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
     """Return all DBC files of the configuration as one database; with [columns] the mapped columns.
 
     With `mapped_only` messages are left out that can have no say in what is mapped, unless a mapped one is missing.
-
-    Raises ConfigError with a line for each file that is missing or not a DBC, and for each
-    message that two files define differently.
+    Raises ConfigError with a line for each file that is missing or no DBC, and each message defined in two ways.
     """
     if config.columns is not None:
         return column_database(mapped_columns(config))
@@ -44,7 +42,7 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
     messages: dict[str, tuple[str, Message]] = {}
     names: set[str] | None = None
     if mapped_only:
-        names = {*config.dbc.checked, *(one["signal"].partition(".")[0] for one in mapped_signals(config))}
+        names = {*config.dbc.checked, *(s.signal.partition(".")[0] for s in mapped_signals(config))}
     for name in config.dbc.input:
         try:
             read = _read_named("dbc.input", config.folder, name, names)
@@ -65,9 +63,8 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
 def checked_messages(config: Config, database: Database) -> frozenset[str]:
     """Return the names of the messages that must carry a right Counter and Checksum.
 
-    Those are messages with both signals in DBC files that soilbus ships, and what
-    `dbc.checked` names in the database; what another maker's Checksum means is not known.  Raises ConfigError
-    with a line for each name that is in no DBC or cannot be checked.
+    Those are messages with both signals in DBC files that soilbus ships, and what `dbc.checked` names; what another
+    maker's Checksum means is not known.  ConfigError has a line for each name that is in no DBC or cannot be checked.
     """
     found: set[str] = set()
     for path in (located(config.folder, name) for name in config.dbc.input):
@@ -89,7 +86,7 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
 def output_database(config: Config) -> Database:
     """Return the messages that soilbus sends, from the address of [j1939] where there is one.
 
-    Raises ConfigError where it is missing, not a DBC, or lacks anything of a message of ours.
+    Raises ConfigError where `output.dbc` is missing, no DBC, or lacks anything of a message of ours.
     """
     name = config.output.dbc
     database = _read_named("output.dbc", config.folder, name)

@@ -22,19 +22,14 @@ MEANING = {
 def doubts(received: Counter[str], refused: Counter[tuple[str, Reason]]) -> dict[str, str]:
     """Return a line for each message with a second sender or with many wrong checksums, by message and reason.
 
-    Parameters
-    ----------
-    received
-        Frames by message.
-    refused
-        Refused ones by message and reason.
+    `received` are frames by message, `refused` those by message and reason.
     """
     lines = {}
     for (name, reason), n in sorted(refused.items()):
         share = n / max(received[name], n)
         if n and (reason is Reason.SECOND_SENDER or (reason is Reason.BAD_CHECKSUM and share >= WRONG_CHECKSUMS)):
-            text = f"{share:.0%} of {received[name]} frames of {name} are refused: {MEANING[reason]}"
-            lines[f"{name} {reason}"] = text
+            said = f"{share:.0%} of {received[name]} frames of {name} are refused"
+            lines[f"{name} {reason}"] = f"{said}: {MEANING[reason]}"
     return lines
 
 

@@ -15,11 +15,11 @@ import struct
 import sys
 import traceback
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from functools import partial
-from io import BufferedReader, RawIOBase
+from io import BufferedReader
 from pathlib import Path
 from shutil import copyfileobj
 from tempfile import NamedTemporaryFile
@@ -36,6 +36,7 @@ HEAD = 1 << 13
 WRAP = 1 << 32
 """Microseconds after which the stamps of an analyser of 32 bits begin again."""
 OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
+TOO_LARGE = f"a block of more than {LIMITS.block >> 20} MiB"
 DAY = 86400.0
 """Seconds after which a clock of hours, minutes and seconds begins again."""
 
@@ -215,57 +216,52 @@ def busmaster(lines: Iterable[str]) -> Iterator[Heard]:
 # --- binary
 
 
-class _PlainBlf(RawIOBase):
-    """A BLF file with the containers unpacked, each bounded, for python-can's reader, which would unpack any size."""
+_BLF_OBJECT, _BLF_CONTAINER = struct.Struct("<4s4xLL"), struct.Struct("<H6xL4x")
+_IS_CONTAINER, _IS_PLAIN, _IS_DEFLATED, _LEAST_BLF_HEAD = 10, 0, 2, 144
 
-    _BASE, _CONTAINER = struct.Struct("<4sHHLL"), struct.Struct("<H6xL4x")
-    _IS_CONTAINER, _IS_DEFLATED = 10, 2
 
-    def __init__(self, stream: BufferedReader) -> None:
-        self._stream = stream
-        self._packed = self._plain = 0
-        head = stream.read(8)
-        self._left = head + self._exactly(max(struct.unpack("<4xL", head)[0] - 8, 0))
+class _BoundedBlf(can.BLFReader):
+    """python-can's reader, which would unpack a container of any size, with each of them bounded."""
 
-    def read(self, size: int = -1) -> bytes:
-        """The next bytes; nothing more at the end."""
-        while len(self._left) < size and (more := self._next()):
-            self._left += more
-        found, self._left = self._left[:size], self._left[size:]
-        return found
-
-    def _exactly(self, size: int) -> bytes:
-        if size > LIMITS.block:
-            raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
-        content = self._stream.read(size)
-        if len(content) < size:
-            raise ValueError("cut off within a block")
-        return content
-
-    def _next(self) -> bytes:
-        head = self._stream.read(self._BASE.size)
-        if not head.strip(b"\0"):  # the end, which may be padded
-            return b""
-        mark, length, version, size, kind = self._BASE.unpack(head)
-        body = self._exactly(max(size - len(head), 0))
-        padding = self._stream.read(size % 4)
-        if mark != b"LOBJ" or kind != self._IS_CONTAINER:
-            return head + body + padding
-        method, _ = self._CONTAINER.unpack_from(body)
-        content = body[self._CONTAINER.size :]
-        if method == self._IS_DEFLATED:
-            decoder = zlib.decompressobj()
-            content = decoder.decompress(content, LIMITS.block)
-            if decoder.unconsumed_tail:
-                raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
-            if not decoder.eof:
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        packed = plain = 0
+        while (head := self.file.read(_BLF_OBJECT.size)).strip(b"\0"):  # the end may be padded
+            mark, size, kind = _BLF_OBJECT.unpack(head)
+            left = max(size - len(head), 0)
+            body = self.file.read(min(left, LIMITS.block + 1))
+            if mark != b"LOBJ" or len(body) > LIMITS.block:
+                raise ValueError(TOO_LARGE if mark == b"LOBJ" else "no object of a BLF log")
+            if len(body) < left:
                 raise ValueError("cut off within a block")
-            method = 0
-        self._packed, self._plain = self._packed + len(body), self._plain + len(content)
-        within_ratio(self._packed, self._plain)
-        size = self._BASE.size + self._CONTAINER.size + len(content)
-        head = self._BASE.pack(mark, length, version, size, kind)
-        return head + self._CONTAINER.pack(method, len(content)) + content + bytes(size % 4)
+            self.file.read(size % 4)
+            if kind != _IS_CONTAINER:
+                continue
+            method, _ = _BLF_CONTAINER.unpack_from(body)
+            content = body[_BLF_CONTAINER.size :]
+            if method == _IS_DEFLATED:
+                content = inflated(content)
+            packed, plain = packed + len(body), plain + len(content)
+            within_ratio(packed, plain)
+            if method in (_IS_PLAIN, _IS_DEFLATED):
+                yield from self._parse_container(content)
+
+
+def _blf(stream: BufferedReader) -> Iterator[Heard]:
+    (size,) = struct.unpack_from("<4xL", stream.peek(8))
+    if not _LEAST_BLF_HEAD <= size <= LIMITS.block:
+        raise ValueError("no head of a BLF log")
+    return (of_message(message, 1) for message in _BoundedBlf(stream))
+
+
+def inflated(packed: bytes) -> bytes:
+    """Return what deflated bytes unpack to; ValueError where it is more than LIMITS.block, or cut off."""
+    decoder = zlib.decompressobj()
+    content = decoder.decompress(packed, LIMITS.block)
+    if decoder.unconsumed_tail:
+        raise ValueError(TOO_LARGE)
+    if not decoder.eof:
+        raise ValueError("cut off within a block")
+    return content
 
 
 @contextmanager
@@ -317,11 +313,7 @@ def check_mf4_blocks(path: Path) -> None:
                 continue  # no block, but data that look like one
             if found[3] not in b"\0\1":
                 raise ValueError("a block that is packed by other than deflate")
-            decoder, place = zlib.decompressobj(), found.end()
-            block = len(decoder.decompress(content[place : place + int.from_bytes(found[6], "little")], LIMITS.block))
-            if decoder.unconsumed_tail:
-                raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
-            plain += block
+            plain += len(inflated(content[found.end() : found.end() + int.from_bytes(found[6], "little")]))
             within_ratio(size, plain)
 
 
@@ -351,7 +343,7 @@ def _sqlite(stream: BufferedReader) -> Iterator[Heard]:
 
 
 _BINARY = {
-    b"LOGG": Format("BLF log", lambda file: (of_message(m, 1) for m in can.BLFReader(_PlainBlf(file)))),  # type: ignore[arg-type]
+    b"LOGG": Format("BLF log", _blf),
     b"MDF     4": Format("MF4 log", _mf4),
     b"\x89MCAP": Format("MCAP log", mcap_frames),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
