@@ -1,7 +1,6 @@
 """Which frames count: all of a frame or nothing, each refusal with a reason and a counter.
 
-`feed` only files a frame under its message; everything else happens in `take` on whole
-columns, once a hop.
+`feed` only files a frame under its message; all else happens in `take` on whole columns, once a hop.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_va
 
 OUT_OF_ORDER = 0.1
 """Seconds by which a frame may be stamped earlier than one that came before it: drivers hand frames over in bunches."""
-CLOCK_STEP = 1.0
-"""The same, above which the clock was set and the new time is believed."""
+CLOCK_STEP = 1.0  # the same, above which the clock was set and the new time is believed
 LONGEST_GAP = 60.0
 """Seconds without a mapped frame after which a new recording begins: the bus slept, or the clock was set ahead."""
 LAST_TIME = 1e10
@@ -53,8 +51,7 @@ _NONE: NDArray[np.float64] = np.empty(0)
 class Counts:
     """Frames since the start: by message name, by (message name, reason), by identifier.
 
-    Extended identifiers have bit 31 set in `unknown_ids`, which lists the first
-    MAX_LISTED_UNKNOWN identifiers; `unknown` counts all.
+    `unknown_ids` lists the first MAX_LISTED_UNKNOWN, extended ones with bit 31; `unknown` counts all.
     """
 
     received: Counter[str] = field(default_factory=Counter)
@@ -63,8 +60,7 @@ class Counts:
     unknown: int = 0
     unknown_ids: Counter[int] = field(default_factory=Counter)
     error_frames: int = 0
-    elsewhere: int = 0
-    """Frames of other channels of a log."""
+    elsewhere: int = 0  # frames of other channels of a log
     clock_steps: int = 0
     senders: dict[str, set[int]] = field(default_factory=dict)
     """Source addresses of a message by its name, where several sent it and none of them is the DBC's."""
@@ -76,22 +72,17 @@ class Counts:
 
 
 class Admission:
-    """Collects frames and hands out admitted samples.
+    """Collects frames and hands out the admitted samples of `channels`, whose messages `database` describes.
 
-    `channels` are what is wanted, `database` describes their messages.  `checked` names the
-    messages whose Counter and Checksum (see `can.checksum`) must be right; other makers' check
-    schemes are not ours to judge, so a message not named is not checked.
+    `checked` names the messages whose Counter and Checksum (see `can.checksum`) must be right.  A message of a standard
+    parameter group (`j1939.STANDARD_PGNS`) is heard from any source and priority, one source at a time, unless the
+    database has several messages of that group.
 
-    A message of a standard parameter group (`j1939.STANDARD_PGNS`) is heard from any source and
-    priority, one source at a time, unless the database has several messages of that group.
+    `at_break` is called before a frame is filed that does not follow the ones before it: its clock was set back, then
+    what is not taken is refused, or there was none for LONGEST_GAP.
 
-    `at_break` is called when a frame comes that does not follow the ones before it (its clock was
-    set back, or there was none for LONGEST_GAP), before it is filed: what is not taken then is
-    refused where the clock was set back.
-
-    Raises ValueError when two messages share an identifier, when a checked message has no
-    Counter or no byte-aligned 8-bit Checksum, or as `ColumnDecoder` does; KeyError for a message
-    or signal that the database does not have.
+    Raises ValueError when two messages share an identifier or a checked one cannot be checked, or as `ColumnDecoder`
+    does; KeyError for a message or signal that is not in the database.
     """
 
     def __init__(self, channels: Iterable[Channel], database: Database, checked: Collection[str] = ()) -> None:
@@ -136,9 +127,8 @@ class Admission:
     def take(self, until: float = math.inf) -> Decoded:
         """Return the samples of all frames filed so far with t < until [s]; later frames stay.
 
-        Every channel has a column, perhaps empty; times do not decrease within it.  A refused
-        frame counts as a refused sample of each of its channels; those of a source that is not
-        listened to, of remote frames and of frames without a time are in `untimed`.
+        Every channel has a column, perhaps empty, whose times do not decrease.  A refused frame counts as a refused
+        sample of each of its channels; those of another source, of remote frames and without a time are in `untimed`.
         """
         out = Decoded(untimed=self._untimed)
         self._untimed = Counter()

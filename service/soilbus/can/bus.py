@@ -26,18 +26,14 @@ from soilbus.words import one_line
 log = logging.getLogger(__name__)
 
 FIRST_BACK_OFF = 0.1
-LONGEST_BACK_OFF = 1.0
-"""Reopening is tried at least this often [s], so that a bus that is back is found in time."""
+LONGEST_BACK_OFF = 1.0  # reopening is tried at least this often [s], so that a bus that is back is found in time
 
-RECEIVE_BUFFER = 4 * 2**20
-"""Bytes asked for frames that wait for us; the kernel takes as many again for itself."""
+RECEIVE_BUFFER = 4 * 2**20  # bytes asked for frames that wait for us; the kernel takes as many again for itself
 SO_RCVBUFFORCE = 33  # which Python does not name
-RETRY = 0.005
-"""Longest wait for a frame [s] while frames of ours wait for room."""
+RETRY = 0.005  # longest wait for a frame [s] while frames of ours wait for room
 GARBLED_FOR = 1.0
 """A driver that for so long [s] hands out nothing but what it cannot read is opened again: it may never come right."""
-SAY_AGAIN = 60.0
-"""A fault that lasts is said in the journal this often [s]."""
+SAY_AGAIN = 60.0  # a fault that lasts is said in the journal this often [s]
 
 _NO_ROOM = {errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK}
 
@@ -120,12 +116,9 @@ class BusCounts:
     dropped: int = 0
     overruns: int = 0
     error_frames: int = 0
-    garbled: int = 0
-    """Frames that the driver could not read: of a serial adapter, say, that lost a character."""
-    foreign: int = 0
-    """Frames of others under our identifiers."""
-    lost: int = 0
-    """How often the bus went away."""
+    garbled: int = 0  # frames that the driver could not read: of a serial adapter, say, that lost a character
+    foreign: int = 0  # frames of others under our identifiers
+    lost: int = 0  # how often the bus went away
     reopened: int = 0
 
 
@@ -145,10 +138,8 @@ class LiveBus:
     ) -> None:
         self.fault = "not opened yet"
         self.state = BusState.UNKNOWN
-        self.last_foreign = -math.inf
-        """When the last foreign frame came, by `clock` [s]."""
-        self.found_nothing = True
-        """Whether the last `receive` returned None because no frame of any kind waited."""
+        self.last_foreign = -math.inf  # when the last foreign frame came, by `clock` [s]
+        self.found_nothing = True  # whether the last `receive` returned None because no frame of any kind waited
         self._opener, self._clock, self._sleep, self._own = opener, clock, sleep, frozenset(own)
         self._counts = BusCounts()
         self._wire: MessageWire | None = None

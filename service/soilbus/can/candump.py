@@ -20,8 +20,7 @@ import can
 Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
 """Time [s], identifier, whether extended, data, whether a remote frame, whether an error frame."""
 
-Heard = tuple[str, Frame]
-"""Channel of a frame, and the frame."""
+Heard = tuple[str, Frame]  # channel of a frame, and the frame
 
 NO_STAMPS = "its lines have no time stamps: record with candump -L, or candump -ta"
 

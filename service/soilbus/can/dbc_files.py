@@ -22,8 +22,7 @@ from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 from soilbus.words import LONGEST_NAME, did_you_mean, one_line, shown
 
-LARGEST = 32 * 2**20
-"""Bytes of a DBC file: five times those of one with 10 000 messages."""
+LARGEST = 32 * 2**20  # bytes of a DBC file: five times those of one with 10 000 messages
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 """A name in a DBC: C_identifier of the DBC file format (Vector, version 1.0.5), with its greatest length."""
 

@@ -25,8 +25,7 @@ _ABOUT = re.compile(
 
 MOST_MULTIPLEXER_VALUES = 1 << 18
 """Values of all ranges of a DBC: 1024 signals in each of 256 pages.  cantools makes 0.3 kB of each."""
-MOST_DIGITS = 12
-"""Digits of a number in a range: a multiplexer of 32 bits has 10."""
+MOST_DIGITS = 12  # digits of a number in a range: a multiplexer of 32 bits has 10
 _RANGES = re.compile(r"\bSG_MUL_VAL_\s+\d+\s+(?P<signal>\w+)\s+\w+(?P<ranges>[^;]*)")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 

@@ -9,8 +9,7 @@ from soilbus.can.channels import Reason
 
 WRONG_CHECKSUMS = 0.05
 """Share of a message's frames from which wrong checksums are said: where `check --log` warns; a good bus has none."""
-SPAN = 10.0
-"""Time [s] over which a service counts them: a default window."""
+SPAN = 10.0  # time [s] over which a service counts them: a default window
 
 MEANING = {
     Reason.BAD_CHECKSUM: "wrong Checksum: a second sender or a bad connection; where nearly all are wrong, another"

@@ -20,8 +20,7 @@ from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
 from soilbus.can.validity import CodeRule, rule_of
 
-TWICE = 0.002
-"""Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
+TWICE = 0.002  # seconds within which a frame that equals the one before it is that frame once more: cycles are longer
 
 COUNTER_ERRORS = 5
 """Net errors of a counter [frames] from which its message is not trusted (opendbc, `MAX_BAD_COUNTER`)."""
@@ -71,13 +70,10 @@ class Inbox:
     last_data: bytes = b""
     counter_errors: int = 0
     """Frames whose counter did not go on by one, less those whose counter did; from 0 to COUNTER_ERRORS."""
-    is_untrusted: bool = False
-    """Whether the errors have reached COUNTER_ERRORS and are not back at 0 yet."""
-    untrusted: Mask | None = None
-    """Which frames of the last batch came while the message was not trusted."""
+    is_untrusted: bool = False  # whether the errors have reached COUNTER_ERRORS and are not back at 0 yet
+    untrusted: Mask | None = None  # which frames of the last batch came while the message was not trusted
     last_frame: tuple[float, int, bytes] = _NO_FRAME
-    missed: int = 0
-    """Frames that the counters of a checked message skip: lost, or refused for their checksum."""
+    missed: int = 0  # frames that the counters of a checked message skip: lost, or refused for their checksum
 
     def forget(self) -> None:
         """Forget all frames of this message, and its last stamp, counter and sender."""

@@ -31,14 +31,11 @@ from soilbus.can.candump import Heard, candump_frames, is_candump, of_message
 from soilbus.can.mcap_frames import mcap_frames
 from soilbus.files import LIMITS, text_lines, within_ratio
 
-HEAD = 1 << 13
-"""Bytes at the begin of a log by which its format is recognised."""
-WRAP = 1 << 32
-"""Microseconds after which the stamps of an analyser of 32 bits begin again."""
+HEAD = 1 << 13  # bytes at the begin of a log by which its format is recognised
+WRAP = 1 << 32  # microseconds after which the stamps of an analyser of 32 bits begin again
 OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
 TOO_LARGE = f"a block of more than {LIMITS.block >> 20} MiB"
-DAY = 86400.0
-"""Seconds after which a clock of hours, minutes and seconds begins again."""
+DAY = 86400.0  # seconds after which a clock of hours, minutes and seconds begins again
 
 
 class Format(NamedTuple):

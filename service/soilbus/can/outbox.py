@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from soilbus.can.publish import Frame
 
-LATE = 0.1
-"""Age [s] at which a frame that did not get out is dropped: its successor is newer."""
+LATE = 0.1  # age [s] at which a frame that did not get out is dropped: its successor is newer
 
 
 class Outbox:
     """Queue of frames to send, a slot for each identifier: a newer frame replaces the one that waits, in its turn."""
 
     def __init__(self) -> None:
-        self.dropped = 0
-        """Frames that were given up since the start."""
+        self.dropped = 0  # frames that were given up since the start
         self._waiting: dict[int, tuple[Frame, float]] = {}
 
     def __len__(self) -> int:

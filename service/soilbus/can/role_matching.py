@@ -35,12 +35,9 @@ WHEELS = frozenset(letter + side for letter in _LETTERS.values() for side in "LR
 """Places of wheels: an axle's letter, and L or R."""
 ASSERTED = 1.0
 """Score from which a match is asserted: the unit fits and at least one strong word of the role stands in a name."""
-MARGIN = 0.3
-"""Score by which it must beat the next candidate: less than one word."""
-LISTED = 0.25
-"""Score from which a candidate is worth a line."""
-SOLE = 0.5
-"""Score from which the only candidate of a slot is taken: half of what an asserted match needs."""
+MARGIN = 0.3  # score by which it must beat the next candidate: less than one word
+LISTED = 0.25  # score from which a candidate is worth a line
+SOLE = 0.5  # score from which the only candidate of a slot is taken: half of what an asserted match needs
 ONLY = "the only candidate"
 """Note on a match that was taken because there is no other."""
 NEEDS = "with "
@@ -48,8 +45,7 @@ NEEDS = "with "
 IN_MESSAGE, IN_COMMENT = 0.7, 0.5
 """Share of a word's weight where it stands in the message's name or in the comment, not in the signal's own name."""
 
-HINT = 0.25
-"""The same of a word against a role, where the signal's own name speaks for it."""
+HINT = 0.25  # the same of a word against a role, where the signal's own name speaks for it
 
 _SPELLINGS: Mapping[str, str] = {
     "torque": "tq trq trque torq moment mom drehmoment drehmom",
@@ -161,14 +157,10 @@ _ROLES: Mapping[str, tuple[float, Mapping[str, float], frozenset[str]]] = {
     "differential_lock": (0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
 }  # fmt: skip
 """Of each role: score of a fitting unit, weights of words, words that speak against it."""
-FEWEST_BITS = 7
-"""Length of the shortest signal that measures anything; shorter ones are codes and flags."""
-COARSEST_POSITION = 2e-5
-"""Resolution [rad] up to which a signal alone can be a latitude: 130 m."""
-_AGAINST = 1.5
-"""Score that a word against a role costs."""
-_NO_UNIT = 0.4
-"""Score that a missing unit costs."""
+FEWEST_BITS = 7  # length of the shortest signal that measures anything; shorter ones are codes and flags
+COARSEST_POSITION = 2e-5  # resolution [rad] up to which a signal alone can be a latitude: 130 m
+_AGAINST = 1.5  # score that a word against a role costs
+_NO_UNIT = 0.4  # score that a missing unit costs
 WHEEL_AND_AXLE = frozenset({"torque", "torque_limit", "motor_speed", "load"})
 WHEEL_ONLY = frozenset({"speed", "sinkage"})
 
@@ -197,8 +189,7 @@ class Candidate:
     """SI value of one unit of the DBC; 1 without a unit."""
     dimension: str
     notes: tuple[str, ...] = ()
-    absent: bool = False
-    """Whether a log has no value of it."""
+    absent: bool = False  # whether a log has no value of it
 
     @property
     def path(self) -> str:

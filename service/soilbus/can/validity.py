@@ -25,8 +25,7 @@ __all__ = [
     "vouching_codes"
 ]  # fmt: skip
 
-REASONS = tuple(Reason)
-"""A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
+REASONS = tuple(Reason)  # A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]
 
 Verdicts = NDArray[np.uint8]
 
