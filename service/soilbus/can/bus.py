@@ -51,7 +51,7 @@ class BusError(Exception):
 def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
     """Return the bus of the section [bus], with kernel filters where it has a kernel; BusError with one line."""
     try:
-        bus = can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
+        bus = can.Bus(**settings, can_filters=filters)
         _prepare(bus)
         return bus
     except Exception as error:  # drivers raise all kinds
@@ -158,7 +158,7 @@ class LiveBus:
 
     @property
     def holds_seconds(self) -> bool:
-        """Whether the frames of a few seconds find room while nobody takes them."""
+        """Whether frames of a few seconds find room while nobody takes them."""
         return self._wire is not None and self._wire.room >= RECEIVE_BUFFER
 
     @property
@@ -179,31 +179,28 @@ class LiveBus:
             raise BusError(f"bus: {one_line(error)}", may_come=True) from None
         self.state, self.fault = BusState.UNKNOWN, ""
 
-    def _reopen(self) -> bool:
-        now = self._clock()
-        if now < self._next_try:
-            return False
+    def _reopen(self) -> None:
+        if self._clock() < self._next_try:
+            return
         try:
             self.open()
         except BusError as error:
             if str(error) != self.fault:
                 log.warning("%s", error)
-            self.fault = str(error)
-            self._wait()
-            return False
+            self._wait(str(error))
+            return
         self._counts.reopened += 1
         log.info("bus is open")
-        return True
 
     def _lost(self, error: Exception) -> None:
         log.warning("bus lost: %s", one_line(error))
-        self.fault = one_line(error)
         self._counts.lost += 1
         self.close()
-        self._wait()
+        self._wait(one_line(error))
 
-    def _wait(self) -> None:
+    def _wait(self, fault: str) -> None:
         """No try for a while, and longer each time until a frame has come."""
+        self.fault = fault
         self._next_try = self._clock() + self._back_off
         self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
 
@@ -213,7 +210,9 @@ class LiveBus:
         Whatever a driver raises that tells of no failure of the bus is one frame that it could not read.
         """
         self.found_nothing = True
-        if self._wire is None and not self._reopen():
+        if self._wire is None:
+            self._reopen()
+        if self._wire is None:
             self._sleep(min(timeout, max(self._next_try - self._clock(), 0.0)))
             return None
         if self._outbox:
@@ -275,8 +274,7 @@ class LiveBus:
     def send(self, frame: Frame) -> bool:
         """Send a frame, or keep it for a moment if there is no room; return whether nothing waits any more.
 
-        A frame is dropped when a newer one of its identifier comes before there is room, when
-        it is late, or when the bus is away.
+        It is dropped when a newer one of its identifier comes first, when it is late, or when the bus is away.
         """
         if self._wire is None:
             self._refused_while_away += 1
@@ -286,7 +284,7 @@ class LiveBus:
         return self._flush(now)
 
     def _flush(self, now: float) -> bool:
-        """Send what waits and is not late at `now`, as far as there is room; whether all of it is out."""
+        """Send what waits and is not late, as far as there is room; whether all of it is out."""
         while self._wire is not None and (frame := self._outbox.first(now)) is not None:
             try:
                 self._wire.send(frame)

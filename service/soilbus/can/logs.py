@@ -43,34 +43,19 @@ class OtherBus(LogError):
 
 
 class Log:
-    """A log that can be read once.
+    """A log that can be read once; "-" is standard input.
 
-    Parameters
-    ----------
-    path
-        Of the file; "-" is standard input.
-    channel
-        Whose frames are wanted, as the log names it (can0, 1); canN is also the channel numbered N + 1, or N in a log
-        whose numbers begin at 0.  Empty for all.
-    demanded
-        Whether a log of one other channel alone is refused; else that channel is taken.
-
-    Attributes
-    ----------
-    kind
-        Its format, such as "candump log, gzip"; empty before the first frame.
-    channels
-        Frames by channel, as far as it was read.
-    chosen
-        The channel whose frames are handed out.
-    span
-        Time from the first frame to the latest one read [s].
+    `channel` is whose frames are wanted, as the log names it (can0, 1); canN is also the channel numbered N + 1, or N
+    in a log whose numbers begin at 0.  Empty for all.  A log of one other channel alone is read, unless `demanded`.
     """
 
     def __init__(self, path: Path, channel: str = "", demanded: bool = False) -> None:
         self.path, self.wanted, self._demanded = path, channel, demanded
-        self.kind, self.chosen, self.span, self._given = "", "", 0.0, 0
-        self.channels: Counter[str] = Counter()
+        self.kind = ""  # its format, such as "candump log, gzip", from the first frame on
+        self.chosen = ""  # the channel whose frames are handed out
+        self.channels: Counter[str] = Counter()  # frames by channel, as far as it was read
+        self.span = 0.0  # time from the first frame to the latest one read [s]
+        self._given = 0
 
     @property
     def name(self) -> str:
@@ -101,39 +86,29 @@ class Log:
     def frames(self) -> Iterator[Frame]:
         """Yield its frames.
 
-        Raises
-        ------
-        LogError
-            The file is missing, no log of frames, damaged, made to fill the memory, or has not the channel wanted.
+        Raises LogError where it is missing, no log of frames, damaged, made to fill the memory, or has not the channel.
         """
         try:
             yield from self._frames()
-        except LogError:
-            raise
-        except FileNotFoundError:
-            raise LogError(f"{self.name}: no such file") from None
-        except ModuleNotFoundError as error:
-            raise self._of_machine(str(error)) from None
-        except MemoryError:
-            raise self._of_machine("not enough memory to read it") from None
-        except OSError as error:
-            if self.channels or error.errno is None:
-                raise LogError(self._damage(error)) from None
-            raise self._of_machine(error.strerror or str(error)) from None
         except Exception as error:  # readers raise all kinds on a damaged file
-            raise LogError(self._damage(error)) from None
+            raise self._fault(error) from None
         if not self.channels:
             raise LogError(f"{self.name}: no frame in it")
 
-    def _of_machine(self, what: str) -> LogError:
-        fault = LogError(f"{self.name}: {what}")
-        fault.lasting = False
-        return fault
-
-    def _damage(self, error: Exception) -> str:
+    def _fault(self, error: Exception) -> LogError:
+        if isinstance(error, LogError):
+            return error
+        if isinstance(error, FileNotFoundError):
+            return LogError(f"{self.name}: no such file")
+        is_of_file_system = isinstance(error, OSError) and error.errno is not None and not self.channels
+        if is_of_file_system or isinstance(error, (MemoryError, ModuleNotFoundError)):
+            why = getattr(error, "strerror", None) or str(error) or "not enough memory to read it"
+            fault = LogError(f"{self.name}: {why}")
+            fault.lasting = False
+            return fault
         what = f"cut off or damaged after {self._given} frames" if self._given else "not a CAN log that can be read"
         why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 150)
-        return f"{self.name}: {what} ({why})"
+        return LogError(f"{self.name}: {what} ({why})")
 
     def _frames(self) -> Iterator[Frame]:
         with opened(self.path) as stream:

@@ -62,11 +62,10 @@ def mcap_frames(stream: BufferedReader) -> Iterator[Heard]:
         from mcap.records import Channel, Message, Schema
     except ModuleNotFoundError:
         raise ModuleNotFoundError("this format needs soilbus[mcap]") from None
-    schemas: set[int] = set()
-    channels: set[int] = set()
-    is_empty = True
+    title = FRAME_SCHEMA["title"]
+    schemas, channels, is_empty = set(), set(), True
     for record in _records(stream):
-        if isinstance(record, Schema) and record.name == FRAME_SCHEMA["title"]:
+        if isinstance(record, Schema) and record.name == title:
             schemas.add(record.id)
         elif isinstance(record, Channel) and record.schema_id in schemas and record.message_encoding == "json":
             channels.add(record.id)
@@ -74,7 +73,7 @@ def mcap_frames(stream: BufferedReader) -> Iterator[Heard]:
             is_empty = False
             yield of_message(_message(record.data))
     if is_empty:
-        raise ValueError(f"it has no CAN frames: no JSON message of schema {FRAME_SCHEMA['title']}")
+        raise ValueError(f"it has no CAN frames: no JSON message of schema {title}")
 
 
 def _message(data: bytes) -> can.Message:
