@@ -9,21 +9,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from soilbus.config.faults import OPEN, fault_lines, open_lines
+from soilbus.config.faults import fault_lines, open_lines
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
-
-__all__ = [
-    "MACHINES",
-    "OPEN",
-    "found_configuration",
-    "load_config",
-    "located",
-    "machine",
-    "overridden",
-    "parse_config",
-    "shipped_dbc",
-]
 
 MAX_FILE_BYTES = 2**20
 """Bytes of a configuration: a thousand times those of a tractor's."""

@@ -34,7 +34,7 @@ from soilbus.can.role_matching import (
 )
 from soilbus.can.validity import vouching_codes
 from soilbus.config.edit import toml_text
-from soilbus.config.file import OPEN
+from soilbus.config.faults import OPEN
 from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts
 from soilbus.words import shown
