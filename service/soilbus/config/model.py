@@ -915,15 +915,12 @@ class Config(_Section):
     def _one_axle_of_a_name(cls, value: Any) -> Any:
         """[[axle]]s of one name that share no other key as one: a motor, and a load cell that stands apart."""
         axles = value.get("axle") if isinstance(value, Mapping) else None
-        if not isinstance(axles, list):
+        if not isinstance(axles, list) or not all(isinstance(axle, Mapping) for axle in axles):
             return value
-        merged: list[Any] = []
+        merged: list[Mapping[str, Any]] = []
         for axle in axles:
             for i, known in enumerate(merged):
-                is_same = (
-                    isinstance(known, Mapping) and isinstance(axle, Mapping) and known.get("name") == axle.get("name")
-                )
-                if is_same and known.keys() & axle.keys() == {"name"}:
+                if known.get("name") == axle.get("name") and known.keys() & axle.keys() == {"name"}:
                     merged[i] = {**known, **axle}
                     break
             else:
