@@ -13,23 +13,11 @@ from typing import Any
 
 import numpy as np
 from cantools.database.can import Database, Message
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
-from soilbus.can.inbox import (
-    Batch,
-    Data,
-    Frame,
-    Inbox,
-    checksum_right,
-    counter_moved,
-    inbox_of,
-    not_twice,
-    of_one_sender,
-    popped,
-    time_forward,
-)
+from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, inbox_of, popped
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 
@@ -44,7 +32,7 @@ MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31
 _FOLLOWS = LONGEST_GAP + OUT_OF_ORDER
-_NONE: NDArray[np.float64] = np.empty(0)
+_NONE: Array = np.empty(0)
 
 
 @dataclass(slots=True)
@@ -158,12 +146,10 @@ class Admission:
         """Return the filters for python-can that pass exactly the frames of the mapped messages."""
         filters: list[dict[str, Any]] = []
         for inbox in self._inboxes:
-            message = inbox.message
-            mask = 0x1FFFFFFF if message.is_extended_frame else 0x7FF
-            if inbox.lock is not None:
-                mask = group_mask(message.frame_id)
-            extended = message.is_extended_frame
-            filters.append({"can_id": message.frame_id & mask, "can_mask": mask, "extended": extended})
+            number, extended = inbox.message.frame_id, inbox.message.is_extended_frame
+            whole = 0x1FFFFFFF if extended else 0x7FF
+            mask = whole if inbox.lock is None else group_mask(number)
+            filters.append({"can_id": number & mask, "can_mask": mask, "extended": extended})
         return filters
 
     def _inbox_of_group(self, arbitration_id: int, extended: bool) -> Inbox | None:
@@ -225,12 +211,9 @@ class Admission:
     def _checked_batch(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> Batch | None:
         """The frames that pass every frame-level check; None when there are none."""
         length = inbox.message.length
-        times, ids, datas = zip(*frames, strict=True)
-        good = frames
-        if set(map(len, datas)) != {length}:
-            good = [f for f in frames if len(f[2]) == length]
-            bad = np.array([f[0] for f in frames if len(f[2]) != length])
-            self._refuse(inbox, bad, Reason.WRONG_LENGTH, out)
+        good = [f for f in frames if len(f[2]) == length]
+        if len(good) < len(frames):
+            self._refuse(inbox, np.array([f[0] for f in frames if len(f[2]) != length]), Reason.WRONG_LENGTH, out)
         if inbox.lock is not None:
             heard = _of_locked_source(inbox.lock, good)
             self._refuse_untimed(inbox, len(good) - len(heard), Reason.WRONG_SOURCE)
@@ -239,17 +222,10 @@ class Admission:
             good = heard
         if not good:
             return None
-        if good is not frames:
-            times, ids, datas = zip(*good, strict=True)
+        times, ids, datas = zip(*good, strict=True)
         payload = np.frombuffer(b"".join(datas), dtype=np.uint8).reshape(-1, length)
         batch = Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
-        for check, reason in (
-            (checksum_right, Reason.BAD_CHECKSUM),
-            (time_forward, Reason.TIME_BACKWARDS),
-            (counter_moved, Reason.BAD_COUNTER),
-            (of_one_sender, Reason.SECOND_SENDER),
-            (not_twice, Reason.DUPLICATE),
-        ):
+        for reason, check in CHECKS.items():
             mask = check(inbox, batch)
             if mask is None or mask.all():
                 continue
@@ -259,7 +235,7 @@ class Admission:
             batch = batch.where(mask)
         return batch
 
-    def _refuse(self, inbox: Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
+    def _refuse(self, inbox: Inbox, t: Array, reason: Reason, out: Decoded) -> None:
         self.counts.refused[inbox.message.name, reason] += len(t)
         for channel in inbox.channels:
             before = out.refused.get((channel.name, reason))
@@ -296,14 +272,9 @@ def _of_locked_source(lock: SourceLock, frames: list[Frame]) -> list[Frame]:
 
 
 def _judge(
-    channel: Channel,
-    rule: CodeRule,
-    message: Message,
-    t: NDArray[np.float64],
-    columns: dict[str, SignalColumn],
-    out: Decoded,
+    channel: Channel, rule: CodeRule, message: Message, t: Array, columns: dict[str, SignalColumn], out: Decoded
 ) -> None:
-    """Puts one channel's samples into `out`: each one admitted, or refused for one reason."""
+    """Put one channel's samples into `out`: each one admitted, or refused for one reason."""
     column = columns[channel.signal]
     verdict = judge_codes(rule, column.raw, column.physical)
     if channel.valid_signal is not None:

@@ -1,20 +1,20 @@
 """One message's frames: filed as they come, and checked as whole columns.
 
-A check gives a mask (N,) of the frames that pass, None where all do.
+A check gives a mask (N,) of the frames that pass, None where all do; CHECKS has their order.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from cantools.database.can import Message
 from numpy.typing import NDArray
 
-from soilbus.arrays import Mask
-from soilbus.can.channels import Channel
+from soilbus.arrays import Array, Mask
+from soilbus.can.channels import Channel, Reason
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
 from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
@@ -35,7 +35,7 @@ Frame = tuple[float, int, Data]
 class Batch:
     """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length); decoded once, when asked for."""
 
-    t: NDArray[np.float64]
+    t: Array
     ids: NDArray[np.int64]
     payload: NDArray[np.uint8]
     _columns: dict[str, SignalColumn] | None = None
@@ -94,22 +94,13 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
     decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
     is_standard = message.is_extended_frame and pgn_of(message.frame_id) in STANDARD_PGNS
     rules = tuple(rule_of(message.get_signal_by_name(c.signal), is_standard) for c in channels)
-    return Inbox(
-        message=message,
-        channels=tuple(channels),
-        rules=rules,
-        decoder=decoder,
-        lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
-        checksum_byte=place,
-    )
+    lock = SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None
+    return Inbox(message, tuple(channels), rules, decoder, lock, place)
 
 
 def popped(inbox: Inbox, until: float) -> list[Frame]:
     """Take the frames before `until` out of the inbox and return them."""
-    frames, inbox.frames = inbox.frames, []
-    if until == math.inf:
-        return frames
-    inbox.frames = [f for f in frames if f[0] >= until]
+    frames, inbox.frames = inbox.frames, [f for f in inbox.frames if f[0] >= until and until < math.inf]
     return [f for f in frames if not f[0] >= until] if inbox.frames else frames
 
 
@@ -117,9 +108,8 @@ def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
     """Return False where the payload does not give the Checksum; None where none is asked for."""
     if inbox.checksum_byte is None:
         return None
-    right: Mask = batch.payload[:, inbox.checksum_byte] == column_checksums(
-        batch.ids, batch.payload, inbox.checksum_byte
-    )
+    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
+    right: Mask = batch.payload[:, inbox.checksum_byte] == due
     return right
 
 
@@ -158,8 +148,8 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
 def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mask) -> Mask | None:
     """True from the frame whose error is the last of COUNTER_ERRORS until no error is left; None without any error.
 
-    A counter that does not go on by one is an error; one that does takes an error back.  The same counter with another
-    payload is COUNTER_ERRORS at once: only a second sender, or a broken one, sends it.
+    A counter that does not go on by one is an error; one that does takes one back.  The same counter with another
+    payload is COUNTER_ERRORS at once: only a second or a broken sender sends it.
     """
     wrong = follows & (step != 1)
     if not inbox.counter_errors and not wrong.any():
@@ -193,3 +183,13 @@ def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:
     same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)
     once: Mask = ~(close & same & (batch.ids == np.concatenate([[id_before], batch.ids[:-1]])))
     return once
+
+
+CHECKS: Mapping[Reason, Callable[[Inbox, Batch], Mask | None]] = {
+    Reason.BAD_CHECKSUM: checksum_right,
+    Reason.TIME_BACKWARDS: time_forward,
+    Reason.BAD_COUNTER: counter_moved,
+    Reason.SECOND_SENDER: of_one_sender,
+    Reason.DUPLICATE: not_twice,
+}
+"""Why a check refuses a frame, and the check, in their order."""
