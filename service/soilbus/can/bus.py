@@ -18,7 +18,6 @@ import can
 
 from soilbus.can import candump
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
-from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
 from soilbus.can.wire import MessageBus, MessageWire, Received, error_number, is_multicast, wire_of
 from soilbus.words import one_line
@@ -30,6 +29,7 @@ LONGEST_BACK_OFF = 1.0  # reopening is tried at least this often [s], so that a 
 
 RECEIVE_BUFFER = 4 * 2**20  # bytes asked for frames that wait for us; the kernel takes as many again for itself
 SO_RCVBUFFORCE = 33  # which Python does not name
+LATE = 0.1  # age [s] at which a frame that did not get out is dropped: its successor is newer
 RETRY = 0.005  # longest wait for a frame [s] while frames of ours wait for room
 GARBLED_FOR = 1.0
 """A driver that for so long [s] hands out nothing but what it cannot read is opened again: it may never come right."""
@@ -143,9 +143,8 @@ class LiveBus:
         self._opener, self._clock, self._sleep, self._own = opener, clock, sleep, frozenset(own)
         self._counts = BusCounts()
         self._wire: MessageWire | None = None
-        self._outbox = Outbox()
+        self._waiting: dict[int, tuple[Frame, float]] = {}  # for room, since when: the newest of each identifier
         self._overruns_before = 0  # of wires that are closed, and what the controller reported
-        self._refused_while_away = 0
         self._next_try = -1.0
         self._back_off = FIRST_BACK_OFF
         self._garbled_since: float | None = None
@@ -164,10 +163,8 @@ class LiveBus:
     @property
     def counts(self) -> BusCounts:
         """Counts of the bus since the start."""
-        counts = self._counts
-        counts.dropped = self._outbox.dropped + self._refused_while_away
-        counts.overruns = self._overruns_before + (self._wire.overruns if self._wire is not None else 0)
-        return counts
+        self._counts.overruns = self._overruns_before + (self._wire.overruns if self._wire is not None else 0)
+        return self._counts
 
     def open(self) -> None:
         """Open the bus now; raise BusError where that fails."""
@@ -215,7 +212,7 @@ class LiveBus:
         if self._wire is None:
             self._sleep(min(timeout, max(self._next_try - self._clock(), 0.0)))
             return None
-        if self._outbox:
+        if self._waiting:
             self._flush(self._clock())
             timeout = min(timeout, RETRY)
         if self._wire is None:
@@ -277,15 +274,20 @@ class LiveBus:
         It is dropped when a newer one of its identifier comes first, when it is late, or when the bus is away.
         """
         if self._wire is None:
-            self._refused_while_away += 1
+            self._counts.dropped += 1
             return False
         now = self._clock()
-        self._outbox.put(frame, now)
+        self._counts.dropped += frame.arbitration_id in self._waiting
+        self._waiting[frame.arbitration_id] = frame, now
         return self._flush(now)
 
     def _flush(self, now: float) -> bool:
         """Send what waits and is not late, as far as there is room; whether all of it is out."""
-        while self._wire is not None and (frame := self._outbox.first(now)) is not None:
+        for identifier, (frame, made) in list(self._waiting.items()):
+            if self._wire is None or now - made > LATE:
+                self._counts.dropped += 1
+                del self._waiting[identifier]
+                continue
             try:
                 self._wire.send(frame)
             except Exception as error:  # drivers raise all kinds
@@ -294,9 +296,9 @@ class LiveBus:
                 else:
                     self._say(f"send queue full: {one_line(error)}")
                 return False
-            self._outbox.done(frame)
             self._counts.sent += 1
-        return self._wire is not None
+            del self._waiting[identifier]
+        return True
 
     def _say(self, text: str) -> None:
         """Into the journal, the same text once in a while."""
@@ -308,7 +310,8 @@ class LiveBus:
     def close(self) -> None:
         """Close the bus."""
         wire, self._wire = self._wire, None
-        self._outbox.clear()
+        self._counts.dropped += len(self._waiting)
+        self._waiting.clear()
         if wire is not None:
             self._overruns_before += wire.overruns
             try:
