@@ -14,7 +14,7 @@ from cantools.database.can import Database, Message
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
 from soilbus.can.columns import column_database, mapped_columns, mapped_signals
-from soilbus.can.dbc_text import check_multiplexers, message_names, of_messages
+from soilbus.can.dbc_text import check_multiplexers, of_messages
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
@@ -35,13 +35,10 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
     """
     if config.columns is not None:
         return column_database(mapped_columns(config))
-    faults: list[str] = []
-    if not config.dbc.input:
-        faults.append("dbc.input: no DBC file given")
+    faults = [] if config.dbc.input else ["dbc.input: no DBC file given"]
     messages: dict[str, tuple[str, Message]] = {}
-    names: set[str] | None = None
-    if mapped_only:
-        names = {*config.dbc.checked, *(s.signal.partition(".")[0] for s in mapped_signals(config))}
+    mapped = {*config.dbc.checked, *(signal.signal.partition(".")[0] for signal in mapped_signals(config))}
+    names = mapped if mapped_only else None
     for name in config.dbc.input:
         try:
             read = _read_named("dbc.input", config.folder, name, names)
@@ -54,7 +51,7 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
                 faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
     if faults:
         raise ConfigError(faults)
-    if names is not None and not names <= messages.keys():
+    if mapped_only and not mapped <= messages.keys():
         return load_databases(config)  # whoever says what is missing may name what is there
     return _database(message for _, message in messages.values())
 
@@ -147,13 +144,11 @@ def _read(path: Path, names: set[str] | None = None) -> Database:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = raw.decode("cp1252", errors="replace")
-    has_some = False
     check_multiplexers(text)
     if names is not None:
-        has_some = bool(message_names(text))
         text = of_messages(text, names, lambda identifier: pgn_of(identifier) in STANDARD_PGNS)
     database = _parsed(text)
-    if not database.messages and not has_some:
+    if names is None and not database.messages:
         raise ValueError("no message in it")
     return database
 

@@ -22,7 +22,6 @@ _ABOUT = re.compile(
     re.MULTILINE,
 )
 
-
 MOST_MULTIPLEXER_VALUES = 1 << 18
 """Values of all ranges of a DBC: 1024 signals in each of 256 pages.  cantools makes 0.3 kB of each."""
 MOST_DIGITS = 12  # digits of a number in a range: a multiplexer of 32 bits has 10
@@ -43,16 +42,8 @@ def check_multiplexers(text: str) -> None:
                 )
 
 
-def message_names(text: str) -> set[str]:
-    """Return the names of the messages that the text defines."""
-    return {found["name"] for found in _MESSAGE.finditer(text)}
-
-
 def of_messages(text: str, names: set[str], also: Callable[[int], bool]) -> str:
-    """Return the DBC's text with these messages, those that share their identifiers, and `also`.
-
-    `also` is asked with an extended identifier.
-    """
+    """Return the DBC's text with these messages, those of their identifiers, and `also` extended identifiers."""
     known = [(int(found["id"]), found["name"]) for found in _MESSAGE.finditer(text)]
     wanted = {number for number, name in known if name in names}
     wanted |= {number for number, _ in known if number & _EXTENDED and also(number & ~_EXTENDED)}

@@ -96,19 +96,18 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
     Raises ConfigError with a line for each fault: a signal that is not in the DBC, cannot be decoded, has a unit of
     another dimension than the role or is mapped twice; a validity signal that cannot work.
     """
-    faults: list[str] = []
-    channels: list[Channel] = []
-    seen: set[tuple[str, str]] = set()
-    for role in _roles(config):
-        key = (role.quantity, role.mapped.signal)
-        if role.quantity in SHARED_ROLES and isinstance(role.part, Wheel) and key in seen:
+    roles = list(_roles(config))
+    first = {(role.quantity, role.mapped.signal): role for role in reversed(roles)}
+    channels, faults = [], []
+    for role in roles:
+        is_shared = role.quantity in SHARED_ROLES and isinstance(role.part, Wheel)
+        if is_shared and first[role.quantity, role.mapped.signal] is not role:
             continue  # the channel of another wheel, too, which came first
-        seen.add(key)
         try:
             channels.append(_channel(config, database, role))
         except _Fault as fault:
             faults.append(f"{role.where}: {fault}")
-    faults += _mapped_twice(_roles(config))
+    faults += _mapped_twice(roles)
     faults += _identifiers_shared(channels, database)
     if faults:
         raise ConfigError(faults)
@@ -156,24 +155,17 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         raise _Fault(f"unit is for the columns of a table: {signal.name} has the unit that the DBC says")
     if role.mapped.valid is not None and signal.name == WHOLE:
         raise _Fault("valid is for messages; of a column leave those cells empty that do not count")
+    factor, offset = _factor(role, signal), STANDARD_GRAVITY * role.mapped.unsprung_mass
     low, high = plausible(config, role.quantity, role.part)
     valid_signal, valid_values = _validity(message, role.mapped)
-    seldom = max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
+    timeout = role.mapped.timeout
+    if timeout is None and role.quantity in POSITION_ROLES:
+        timeout = max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
+    wheel = role.part.name if role.part else ""
     return Channel(
-        quantity=role.quantity,
-        wheel=role.part.name if role.part else "",
-        message=message.name,
-        signal=signal.name,
-        factor=_factor(role, signal),
-        offset=STANDARD_GRAVITY * role.mapped.unsprung_mass,
-        low=low,
-        high=high,
-        valid_signal=valid_signal,
-        valid_values=valid_values,
-        timeout=role.mapped.timeout or (seldom if role.quantity in POSITION_ROLES else None),
-        delay=role.mapped.delay,
-        key=role.where,
-    )
+        role.quantity, wheel, message.name, signal.name, factor, offset, low, high, valid_signal, valid_values,
+        timeout, role.mapped.delay, role.where,
+    )  # fmt: skip
 
 
 def found_signal(database: Database, path: str) -> tuple[Message, Signal]:
@@ -192,8 +184,8 @@ def _find_signal(message: Message, name: str) -> Signal:
     try:
         return check_decodable(message, name)
     except KeyError:
-        names = [s.name for s in message.signals]
-        raise _Fault(f"no signal {name} in message {message.name}{did_you_mean(name, names)}") from None
+        meant = did_you_mean(name, (s.name for s in message.signals))
+        raise _Fault(f"no signal {name} in message {message.name}{meant}") from None
     except ValueError as error:
         raise _Fault(str(error)) from None
 
@@ -308,25 +300,21 @@ _GREATEST = {
 }  # fmt: skip
 
 
-def _mapped_twice(roles: Iterable[_Role]) -> list[str]:
+def _mapped_twice(roles: Iterable[_Role]) -> Iterator[str]:
     """A line for each signal of two roles; limits of several wheels, or one measurement of several, are none."""
     first: dict[str, _Role] = {}
-    faults: list[str] = []
     for role in roles:
         known = first.setdefault(role.mapped.signal, role)
         of_wheels = isinstance(known.part, Wheel) and isinstance(role.part, Wheel)
         once = role.quantity == "torque_limit" or (of_wheels and role.quantity in SHARED_ROLES)
         if known is not role and not (once and known.quantity == role.quantity):
-            faults.append(f"{role.where}: {role.mapped.signal} is already mapped to {known.where}")
-    return faults
+            yield f"{role.where}: {role.mapped.signal} is already mapped to {known.where}"
 
 
-def _identifiers_shared(channels: Iterable[Channel], database: Database) -> list[str]:
+def _identifiers_shared(channels: Iterable[Channel], database: Database) -> Iterator[str]:
     owner: dict[tuple[int, bool], str] = {}
-    faults: list[str] = []
     for name in dict.fromkeys(c.message for c in channels):
         message = database.get_message_by_name(name)
         known = owner.setdefault((message.frame_id, message.is_extended_frame), name)
         if known != name:
-            faults.append(f"messages {known} and {name} have the same identifier {message.frame_id:#x}")
-    return faults
+            yield f"messages {known} and {name} have the same identifier {message.frame_id:#x}"
