@@ -2,12 +2,13 @@
 
     first bytes -> Format(name, frames)         frames(stream) -> (channel, frame) of each
 
-python-can reads ASC, BLF, TRC and MF4; candump (can/candump.py), CSV and BUSMASTER are read here.
+python-can reads ASC, BLF, TRC, MF4 and its own CSV; candump (can/candump.py), other CSVs and BUSMASTER are read here.
 """
 
 from __future__ import annotations
 
 import gc
+import math
 import mmap
 import re
 import sqlite3
@@ -15,9 +16,9 @@ import struct
 import sys
 import traceback
 import zlib
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
@@ -32,10 +33,11 @@ from soilbus.can.mcap_frames import mcap_frames
 from soilbus.files import LIMITS, text_lines, within_ratio
 
 HEAD = 1 << 13  # bytes at the begin of a log by which its format is recognised
-WRAP = 1 << 32  # microseconds after which the stamps of an analyser of 32 bits begin again
+WRAP = 2**32 / 1e6  # seconds after which the stamps of an analyser of 32 bits begin again
 OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
 TOO_LARGE = f"a block of more than {LIMITS.block >> 20} MiB"
 DAY = 86400.0  # seconds after which a clock of hours, minutes and seconds begins again
+RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
 class Format(NamedTuple):
@@ -62,13 +64,13 @@ def format_of(head: bytes) -> Format:
         raise ValueError("binary data of no known format")
     first = lines[0]
     if first.startswith("***BUSMASTER"):
-        return Format("BUSMASTER log", lambda stream: busmaster(text_lines(stream)))
+        return Format("BUSMASTER log", _busmaster)
     if csv := csv_of_frames(first):
         return csv
     if first.startswith(";") or _TRC_LINE.match(first):
         return Format("PCAN TRC log", lambda stream: map(of_message, can.TRCReader(text_lines(stream))))  # type: ignore[arg-type]
     if any(map(_ASC_LINE.match, lines)):
-        return Format("Vector ASC log", lambda stream: asc(text_lines(stream)))
+        return Format("Vector ASC log", _asc)
     if any(map(is_candump, lines)):
         return Format("candump log", lambda stream: candump_frames(text_lines(stream)))
     if "\ufffd" in text:
@@ -90,22 +92,30 @@ _TRC_LINE = re.compile(r"\d+\)\s+\d")
 _ASC_NO_FRAME = re.compile(r"\s*+(date\s|[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s))", re.IGNORECASE)
 """Events that python-can would take for frames ("Start of measurement" of CAN FD, requests to send), and the date:
 in some languages python-can does not know it and reads no base after it."""
-RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
-def asc(lines: Iterable[str]) -> Iterator[Heard]:
-    """Yield the frames of a Vector ASC log.
-
-    Its stamps count from its begin.  Events between frames do not come from the reader, so stamps that only say how
-    long after the last event each came cannot be summed up: ValueError.
-    """
-    reader = can.ASCReader(line for line in lines if not _ASC_NO_FRAME.match(line))  # type: ignore[arg-type]
+def _asc(stream: BufferedReader) -> Iterator[Heard]:
+    """Stamps count from the log's begin; those after the last event cannot be summed up, as not all events are read."""
+    reader = can.ASCReader(line for line in text_lines(stream) if not _ASC_NO_FRAME.match(line))  # type: ignore[arg-type]
     last = float("-inf")
     for message in reader:
         if message.timestamp < last and reader.timestamps_format == "relative":
             raise ValueError(RELATIVE)
         last = message.timestamp
         yield of_message(message, 1)
+
+
+class _Clock:
+    """Time [s] that goes on where the stamps begin again after a period [s]."""
+
+    def __init__(self, period: float) -> None:
+        self._period, self._late, self._last = period, 0.0, -math.inf
+
+    def __call__(self, t: float) -> float:
+        if self._period > self._last > t + self._period / 2.0:
+            self._late += self._period
+        self._last = t
+        return t + self._late
 
 
 def _truth(text: str) -> bool:
@@ -151,7 +161,7 @@ def _of_csv(
 ) -> Iterator[Heard]:
     rows = (line for line in text_lines(stream) if line.strip())
     names = _cells(next(rows).lower())
-    late, last = 0.0, float("-inf")
+    unwrapped = _Clock(WRAP if said is _gvret else math.inf)
     for line in rows:
         cells = _cells(line)
         if len(cells) > len(names):
@@ -162,26 +172,20 @@ def _of_csv(
             t, extended, data, length, remote = said(row)
         except KeyError as name:
             raise ValueError(f"a line without {name}") from None
-        if said is _gvret and last - t > WRAP / 2e6 and last < WRAP / 1e6:
-            late += WRAP / 1e6
-        last = t
         if not remote and len(data) != length:
             raise ValueError(f"a frame of {length} bytes has {len(data)}")
         channel = row.get("bus") or row.get("buschannel") or ""
-        yield channel, (t + late, identifier & 0x1FFFFFFF, extended, data, remote, False)
+        yield channel, (unwrapped(t), identifier & 0x1FFFFFFF, extended, data, remote, False)
 
 
 _BUSMASTER_DATE = re.compile(r"\*\*\*START DATE AND TIME (\d+):(\d+):(\d+) ")
 
 
-def busmaster(lines: Iterable[str]) -> Iterator[Heard]:
-    """Yield the frames of a log of BUSMASTER; stamps are the time of the day, or count from its begin.
-
-    Raises ValueError where they only say how long after the frame before each came.
-    """
-    base, midnight, turn, last = 16, 0.0, 0.0, 0.0
+def _busmaster(stream: BufferedReader) -> Iterator[Heard]:
+    """Stamps are the time of the day, or count from the log's begin."""
+    base, midnight, unwrapped = 16, 0.0, _Clock(DAY)
     in_day = True
-    for line in lines:
+    for line in text_lines(stream):
         if line.startswith("***"):
             if line.startswith("***DEC"):
                 base = 10
@@ -191,23 +195,18 @@ def busmaster(lines: Iterable[str]) -> Iterator[Heard]:
                 in_day = False
             elif found := _BUSMASTER_DATE.match(line):
                 day, month, year = map(int, found.groups())
-                midnight, turn, last = datetime(year, month, day, tzinfo=UTC).timestamp(), 0.0, 0.0
+                midnight, unwrapped = datetime(year, month, day, tzinfo=UTC).timestamp(), _Clock(DAY)
+        if line.startswith("***") or not line.strip():
             continue
-        words = line.split()
-        if not words:
-            continue
-        stamp, _, channel, identifier, kind, length, *data = words
-        hours, minutes, seconds, parts = stamp.split(":")  # the last in units of 0.1 ms
-        t = timedelta(hours=int(hours), minutes=int(minutes), seconds=int(seconds)).total_seconds() + int(parts) / 1e4
-        if last - t > DAY / 2.0:
-            turn += DAY
-        last = t
+        stamp, _, channel, identifier, kind, length, *data = line.split()
+        hours, minutes, seconds, parts = map(int, stamp.split(":"))  # the last in units of 0.1 ms
+        t = unwrapped(3600.0 * hours + 60.0 * minutes + seconds + parts / 1e4)
         remote, n = "r" in kind.lower(), int(length)
         content = b"" if remote else bytes(int(byte, base) for byte in data[:n])
         if not remote and len(content) != n:
             raise ValueError(f"a frame of {n} bytes has {len(content)}")
         number = int(identifier, 16 if identifier.lower().startswith("0x") else base)
-        yield channel, (t + turn + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
+        yield channel, (t + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
 
 
 # --- binary
