@@ -42,10 +42,7 @@ _ERROR_ID = "20000080"
 
 
 def frame_of(message: can.Message) -> Frame:
-    """Return the frame that a message of python-can stands for.
-
-    Raises TypeError or ValueError where its time or identifier is no number, as from a damaged SQLite log.
-    """
+    """Return the frame of a message of python-can; TypeError or ValueError where time or identifier is no number."""
     return (
         float(message.timestamp),
         index(message.arbitration_id),
@@ -77,10 +74,7 @@ def is_candump(line: str) -> bool:
 
 
 def candump_frames(lines: Iterable[str]) -> Iterator[Heard]:
-    """Yield the frames of a log's lines with their channels; the same that `can.CanutilsLogReader` reads.
-
-    Raises what the reader (ValueError, IndexError) or `lines` raises, or ValueError for half a byte.
-    """
+    """Yield the frames that `can.CanutilsLogReader` reads of lines; ValueError or IndexError where it cannot."""
     for line in lines:
         found = _PLAIN_LINE(line) or _PLAIN_LINE(line := _log_line(line))
         if found is not None and len(found[4]) % 2 == 0:
@@ -91,11 +85,7 @@ def candump_frames(lines: Iterable[str]) -> Iterator[Heard]:
 
 
 def _log_line(line: str) -> str:
-    """A line that candump printed as `candump -L` would write it; any other line unchanged.
-
-    An error frame of any class gets the identifier by which python-can knows one.  Stamps by date are taken as UTC.
-    Raises ValueError for a line without a stamp, and for one that was cut off.
-    """
+    """A line of candump as `candump -L` would write it, dates as UTC, error frames as python-can knows them."""
     found = _LOG_LINE.match(line) or _CONSOLE_LINE.match(line)
     if (found is None and _UNSTAMPED.match(line)) or (found is not None and found["time"] is None):
         raise ValueError(NO_STAMPS)

@@ -35,10 +35,9 @@ def checkable_byte(message: Message) -> int | None:
 
 
 def frame_checksum(arbitration_id: int, data: bytes, checksum_byte_index: int) -> int:
-    """Return the checksum of one frame, 0..255: identifier (4 bytes, least significant first), then payload.
+    """Return the checksum of one frame, 0..255: identifier (4 bytes, least significant first), then other payload.
 
-    The byte that carries the checksum is left out.  Raises IndexError when `data` has no such
-    byte, OverflowError when the identifier does not fit 4 bytes.
+    Raises IndexError when `data` has no byte that carries it, OverflowError for an identifier of more than 4 bytes.
     """
     if not 0 <= checksum_byte_index < len(data):
         raise IndexError(f"no byte {checksum_byte_index} in {len(data)} bytes")

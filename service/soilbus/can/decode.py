@@ -36,18 +36,14 @@ class SignalColumn(NamedTuple):
 class ColumnDecoder:
     """Decoder of the named signals of one message, and of the multiplexers they hang on.
 
-    Raises KeyError for a signal that the message does not have and ValueError for one that
-    cannot be cut out: outside the message, longer than 64 bits, or defined twice.
+    Raises KeyError for a signal that is not in the message and ValueError for one that cannot be cut out.
     """
 
     def __init__(self, message: Message, signals: Sequence[str]) -> None:
         self._placed = [(s, _first_bit(s, message.length)) for s in _with_multiplexers(message, signals)]
 
     def columns(self, payload: Payload) -> dict[str, SignalColumn]:
-        """Return the raw codes, physical values and presence by signal name; payload (N, message length).
-
-        Signals that the wanted ones hang on are among them.
-        """
+        """Return the values of the signals, and of those they hang on, by name; payload (N, message length)."""
         columns: dict[str, SignalColumn] = {}
         with np.errstate(over="ignore", invalid="ignore"):  # a signalling nan is still only a nan
             for signal, first_bit in self._placed:
@@ -87,24 +83,16 @@ def check_decodable(message: Message, name: str) -> Signal:
 def _with_multiplexers(message: Message, names: Sequence[str]) -> list[Signal]:
     """Signals, each once and after the multiplexer that it hangs on."""
     ordered: dict[str, Signal] = {}
-
-    def add(name: str) -> None:
-        signal = check_decodable(message, name)
-        if signal.multiplexer_signal is not None and signal.multiplexer_signal not in ordered:
-            add(signal.multiplexer_signal)
-        ordered[name] = signal
-
     for name in names:
-        add(name)
+        chain = [check_decodable(message, name)]
+        while (above := chain[-1].multiplexer_signal) is not None:
+            chain.append(check_decodable(message, above))
+        ordered |= {signal.name: signal for signal in reversed(chain)}
     return list(ordered.values())
 
 
 def _first_bit(signal: Signal, message_length: int) -> int:
-    """The place of a signal's first bit, bytes and bits counted in its own byte order.
-
-    `start` of a DBC is the signal's least significant bit (little endian) or its most significant (big endian), bit 0
-    of a byte being the least significant.  Raises ValueError when the signal does not lie within the message.
-    """
+    """The place of a signal's first bit in its own byte order; a DBC counts the bits of a byte from the least one."""
     start, length = signal.start, signal.length
     first = 8 * (start // 8) + (7 - start % 8) if signal.byte_order == "big_endian" else start
     if not (1 <= length <= 64 and first >= 0 and first + length <= 8 * message_length):

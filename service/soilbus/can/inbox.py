@@ -124,10 +124,7 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask:
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where a frame repeats the counter of its sender's last one; None where no counter is checked.
-
-    What the counters skip is counted in `inbox.missed`; what cannot be trusted is kept for `of_one_sender`.
-    """
+    """Return False where a frame repeats its sender's last counter; keep what cannot be trusted for `of_one_sender`."""
     inbox.untrusted = None
     if inbox.checksum_byte is None:
         return None
