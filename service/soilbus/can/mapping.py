@@ -25,32 +25,18 @@ POSITION_ROLES = ("latitude", "longitude")
 LOCK = "differential_lock"
 OF_MOTION = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "roll", "steering_angle")
 VEHICLE_ROLES = (*OF_MOTION, *POSITION_ROLES)
-OPTIONAL_ROLES = ("yaw_rate", "roll", "steering_angle", LOCK, *POSITION_ROLES)
-"""Without them a window is as good as before."""
+OPTIONAL_ROLES = ("yaw_rate", "roll", "steering_angle", LOCK, *POSITION_ROLES)  # a window is as good without
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
-LEAST_GAP, GAP_CYCLES = 2.0, 1.5
-"""A position is stale after these seconds, or, where the DBC says that it is sent seldom, after these cycles."""
+LEAST_GAP, GAP_CYCLES = 2.0, 1.5  # seconds, and cycles of what is sent seldom, after which a position is stale
 _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 
 DIMENSIONS: Mapping[str, tuple[str, ...]] = {
-    "torque": ("torque",),
-    "torque_limit": ("torque",),
-    "motor_speed": ("rotation",),
-    "speed": ("rotation", "speed"),
-    "load": ("force", "mass"),
-    "sinkage": ("length",),
-    "ground_speed": ("speed",),
-    "draft": ("force",),
-    "pitch": ("angle",),
-    "acceleration": ("acceleration",),
-    "yaw_rate": ("rotation",),
-    "roll": ("angle",),
-    "steering_angle": ("angle",),
-    LOCK: ("",),
-    "latitude": ("angle",),
-    "longitude": ("angle",),
-}
+    "torque": ("torque",), "torque_limit": ("torque",), "motor_speed": ("rotation",), "speed": ("rotation", "speed"),
+    "load": ("force", "mass"), "sinkage": ("length",), "ground_speed": ("speed",), "draft": ("force",),
+    "pitch": ("angle",), "acceleration": ("acceleration",), "yaw_rate": ("rotation",), "roll": ("angle",),
+    "steering_angle": ("angle",), LOCK: ("",), "latitude": ("angle",), "longitude": ("angle",),
+}  # fmt: skip
 """Dimensions that the unit of a role's signal may have, that of its values in SI first."""
 _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
 _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
@@ -65,15 +51,11 @@ class _Number(NamedTuple):
     unit: str
 
 
+_PRESSURES = {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757}
 _NUMBERS: Mapping[str, _Number] = {
     "torque_constant": _Number("current", {"": 1.0, "A": 1.0, "mA": 1e-3, "kA": 1e3}, "torque", "N m/A"),
     "reference_torque": _Number("percentage", {"%": 0.01}, "torque", "N m"),
-    "effective_area": _Number(
-        "pressure",
-        {"": 1.0, "Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757},
-        "force",
-        "m^2",
-    ),
+    "effective_area": _Number("pressure", {"": 1.0, **_PRESSURES}, "force", "m^2"),
 }
 """By key of the mapping."""
 
@@ -86,8 +68,7 @@ class _Role(NamedTuple):
     quantity: str
     part: Wheel | Axle | None
     mapped: Mapped
-    where: str
-    """The key in the configuration file."""
+    where: str  # the key in the configuration file
 
 
 def channels_of(config: Config, database: Database) -> list[Channel]:
@@ -283,13 +264,12 @@ def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple
         return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
     if quantity == "sinkage":
         return -0.1 * radius, radius
-    greatest = {
-        "torque": 2.0 * weight * radius,
-        "torque_limit": 2.0 * weight * radius,
-        "speed": MAX_SPEED / radius,
-        "motor_speed": MAX_SPEED / radius,
-        "draft": 2.0 * weight,
-    }.get(quantity, _GREATEST.get(quantity, math.inf))
+    if quantity in ("torque", "torque_limit"):
+        greatest = 2.0 * weight * radius
+    elif quantity in ("speed", "motor_speed"):
+        greatest = MAX_SPEED / radius
+    else:
+        greatest = 2.0 * weight if quantity == "draft" else _GREATEST.get(quantity, math.inf)
     return -greatest, greatest
 
 

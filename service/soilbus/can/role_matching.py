@@ -29,22 +29,16 @@ from soilbus.can.units import Unit, unit_of
 
 _LETTERS = {"front": "F", "middle": "M", "rear": "R", **{str(k): str(k) for k in range(1, 5)}}
 """Letter of the wheels of each axle, front to rear; four axles have numbers."""
-AXLES = (*_LETTERS, "both")
-"""Places of axles; `both` for one motor that drives all of them."""
+AXLES = (*_LETTERS, "both")  # places of axles; `both` for one motor that drives all of them
 WHEELS = frozenset(letter + side for letter in _LETTERS.values() for side in "LR")
-"""Places of wheels: an axle's letter, and L or R."""
-ASSERTED = 1.0
-"""Score from which a match is asserted: the unit fits and at least one strong word of the role stands in a name."""
+ASSERTED = 1.0  # score from which a match is asserted: the unit fits and a strong word of the role stands in a name
 MARGIN = 0.3  # score by which it must beat the next candidate: less than one word
 LISTED = 0.25  # score from which a candidate is worth a line
 SOLE = 0.5  # score from which the only candidate of a slot is taken: half of what an asserted match needs
-ONLY = "the only candidate"
-"""Note on a match that was taken because there is no other."""
-NEEDS = "with "
-"""Begin of a note on a number that the DBC does not have."""
+ONLY = "the only candidate"  # note on a match that was taken because there is no other
+NEEDS = "with "  # begin of a note on a number that the DBC does not have
 IN_MESSAGE, IN_COMMENT = 0.7, 0.5
 """Share of a word's weight where it stands in the message's name or in the comment, not in the signal's own name."""
-
 HINT = 0.25  # the same of a word against a role, where the signal's own name speaks for it
 
 _SPELLINGS: Mapping[str, str] = {
@@ -103,55 +97,31 @@ _ASKED = frozenset({"request", "least", "rated"})
 _HITCH = frozenset({"hitch", "draft", "pull", "link"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
 _ROLES: Mapping[str, tuple[float, Mapping[str, float], frozenset[str]]] = {
-    "torque": (
-        0.6,
-        {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
-        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"},
-    ),
+    "torque": (0.6, {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
+        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"}),
     "torque_limit": (0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
-    "motor_speed": (
-        0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
-        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"},
-    ),
-    "speed": (
-        0.1, {"wheel": 0.8, "speed": 0.2},
-        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"},
-    ),
-    "load": (
-        0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
-        _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"},
-    ),
+    "motor_speed": (0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
+        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"}),
+    "speed": (0.1, {"wheel": 0.8, "speed": 0.2},
+        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"}),
+    "load": (0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
+        _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"}),
     "sinkage": (0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
-    "ground_speed": (
-        0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
-        _ASKED
-        | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"}
-        | {"relative"},
-    ),
-    "draft": (
-        0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
-        _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"},
-    ),
-    "pitch": (
-        0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
-        _ASKED | {"rate", "roll", "lateral", "steering", "hitch"},
-    ),
-    "roll": (
-        0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
-        _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"},
-    ),
-    "yaw_rate": (
-        0.1, {"yaw": 1.0, "rate": 0.2},
-        _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"},
-    ),
-    "acceleration": (
-        0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
-        _ASKED | {"lateral", "vertical", "limit"},
-    ),
-    "steering_angle": (
-        0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
-        _ASKED | {"hand", "column", "rate", "limit", "fraction"},
-    ),
+    "ground_speed": (0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
+        _ASKED | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor",
+         "coverage", "relative"}),
+    "draft": (0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
+        _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"}),
+    "pitch": (0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
+        _ASKED | {"rate", "roll", "lateral", "steering", "hitch"}),
+    "roll": (0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
+        _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"}),
+    "yaw_rate": (0.1, {"yaw": 1.0, "rate": 0.2},
+        _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"}),
+    "acceleration": (0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
+        _ASKED | {"lateral", "vertical", "limit"}),
+    "steering_angle": (0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
+        _ASKED | {"hand", "column", "rate", "limit", "fraction"}),
     "latitude": (0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
     "longitude": (0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
     "differential_lock": (0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
@@ -163,10 +133,7 @@ _AGAINST = 1.5  # score that a word against a role costs
 _NO_UNIT = 0.4  # score that a missing unit costs
 WHEEL_AND_AXLE = frozenset({"torque", "torque_limit", "motor_speed", "load"})
 WHEEL_ONLY = frozenset({"speed", "sinkage"})
-
-
-UNIT_ALONE = ""
-"""In the place of a role: a signal whose unit is one of ours, and whose name says nothing."""
+UNIT_ALONE = ""  # in the place of a role: a signal whose unit is one of ours, and whose name says nothing
 
 
 class Slot(NamedTuple):
@@ -185,8 +152,7 @@ class Candidate:
     signal: str
     score: float
     unit: str
-    factor: float
-    """SI value of one unit of the DBC; 1 without a unit."""
+    factor: float  # SI value of one unit of the DBC; 1 without a unit
     dimension: str
     notes: tuple[str, ...] = ()
     absent: bool = False  # whether a log has no value of it
@@ -203,8 +169,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Result of the matching: asserted signals by slot, candidates of open slots, rivals of asserted ones, and
-    signals of which only the unit is known."""
+    """Asserted signals by slot, candidates of open slots, rivals of asserted ones, signals with only a unit."""
 
     asserted: dict[Slot, Candidate] = field(default_factory=dict)
     open: dict[Slot, list[Candidate]] = field(default_factory=dict)
@@ -414,8 +379,7 @@ def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str])
 # --- words ---
 
 
-PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"
-"""A piece of a name: names are parted at underscores, capitals and digits."""
+PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"  # names are parted at underscores, capitals and digits
 
 
 @cache
