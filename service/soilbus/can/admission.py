@@ -21,13 +21,14 @@ from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, inbox_of, poppe
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 
-OUT_OF_ORDER = 0.1
-"""Seconds by which a frame may be stamped earlier than one that came before it: drivers hand frames over in bunches."""
+OUT_OF_ORDER = 0.1  # seconds by which a frame may be stamped before an earlier one: drivers hand them over in bunches
 CLOCK_STEP = 1.0  # the same, above which the clock was set and the new time is believed
-LONGEST_GAP = 60.0
-"""Seconds without a mapped frame after which a new recording begins: the bus slept, or the clock was set ahead."""
-LAST_TIME = 1e10
-"""Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
+LONGEST_GAP = (
+    60.0  # seconds without a mapped frame after which a new recording begins: the bus slept, a clock was set
+)
+LAST_TIME = (
+    1e10  # stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move
+)
 MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31

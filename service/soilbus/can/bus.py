@@ -26,17 +26,14 @@ log = logging.getLogger(__name__)
 
 FIRST_BACK_OFF = 0.1
 LONGEST_BACK_OFF = 1.0  # reopening is tried at least this often [s], so that a bus that is back is found in time
-
 RECEIVE_BUFFER = 4 * 2**20  # bytes asked for frames that wait for us; the kernel takes as many again for itself
 SO_RCVBUFFORCE = 33  # which Python does not name
 LATE = 0.1  # age [s] at which a frame that did not get out is dropped: its successor is newer
 RETRY = 0.005  # longest wait for a frame [s] while frames of ours wait for room
-GARBLED_FOR = 1.0
-"""A driver that for so long [s] hands out nothing but what it cannot read is opened again: it may never come right."""
+GARBLED_FOR = 1.0  # a driver that for so long [s] reads nothing that it understands is opened again
 SAY_AGAIN = 60.0  # a fault that lasts is said in the journal this often [s]
 
 _NO_ROOM = {errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK}
-
 _KERNEL_WITHOUT_CAN = {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT}
 
 
@@ -72,22 +69,18 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
 
 def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[candump.Frame]:
     """Yield the frames that the bus carries from now on; BusError where it cannot be opened or goes away."""
-    bus = open_bus(settings)
     try:
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            try:
-                message = bus.recv(left)
-            except (OSError, can.CanError) as error:
-                raise bus_fault(settings, error) from None
-            if message is not None:
-                yield candump.frame_of(message)
-    finally:
-        bus.shutdown()
+        with open_bus(settings) as bus:
+            end = time.monotonic() + seconds
+            while (left := end - time.monotonic()) > 0.0:
+                if (message := bus.recv(left)) is not None:
+                    yield candump.frame_of(message)
+    except (OSError, can.CanError) as error:
+        raise bus_fault(settings, error) from None
 
 
 def _prepare(bus: can.BusABC) -> None:
-    """Raises OSError for an interface that is down: the kernel binds to it all the same."""
+    """Raise OSError for an interface that is down: the kernel binds to it all the same."""
     if is_multicast(bus):
         with socket.socket(fileno=os.dup(bus.fileno())) as same:
             ask_for_buffer(same)

@@ -37,8 +37,7 @@ _CONSOLE_LINE = re.compile(
 )
 _UNSTAMPED = re.compile(r"\s*+[^\s(]\S*+\s++[0-9A-Fa-f]{3,8}#")
 _ERROR_FLAG = 0x20000000
-_ERROR_ID = "20000080"
-"""The identifier of an error frame that python-can takes for one; of candump's others it makes frames of data."""
+_ERROR_ID = "20000080"  # of an error frame that python-can takes for one; of candump's others it makes frames of data
 
 
 def frame_of(message: can.Message) -> Frame:

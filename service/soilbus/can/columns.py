@@ -21,8 +21,7 @@ from soilbus.config.model import Signal as MappedSignal
 
 _IN_BRACKETS = re.compile(r".*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 _BEHIND = re.compile(r".*?[_ /,]([^\s_,]+)\s*")
-LETTERS = frozenset({"N", "m", "g"})
-"""Units of one letter that may end a column's name ("draft_N"); other single letters number or place a sensor."""
+LETTERS = frozenset({"N", "m", "g"})  # units of one letter that may end a column's name; others number a sensor
 
 
 def unit_in(column: str) -> str:

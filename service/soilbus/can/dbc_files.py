@@ -23,8 +23,7 @@ from soilbus.files import read_bounded
 from soilbus.words import LONGEST_NAME, did_you_mean, one_line, shown
 
 LARGEST = 32 * 2**20  # bytes of a DBC file: five times those of one with 10 000 messages
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
-"""A name in a DBC: C_identifier of the DBC file format (Vector, version 1.0.5), with its greatest length."""
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")  # C_identifier of the DBC file format (Vector, 1.0.5)
 
 
 def load_databases(config: Config, mapped_only: bool = False) -> Database:
@@ -159,20 +158,13 @@ def _parsed(text: str) -> Database:
     # not strict: an overlap in a message that nobody maps is none of our business
     database = Database(strict=False)
     database.add_dbc_string(text)
-    for message in database.messages:
-        _check_name("message", message.name)
-        for signal in message.signals:
-            _check_name(f"signal of {message.name}", signal.name)
-    for node in database.nodes:
-        _check_name("node", node.name)
+    named = [("message", message.name) for message in database.messages]
+    named += [(f"signal of {message.name}", signal.name) for message in database.messages for signal in message.signals]
+    for what, name in (*named, *(("node", node.name) for node in database.nodes)):
+        if _IDENTIFIER.fullmatch(name) is None:  # attributes for long names can hold anything
+            said = "letters, digits and _, at most 128 of them, a digit not first"
+            raise ValueError(f"the {what} named {shown(name, LONGEST_NAME)}: a name is {said}")
     return database
-
-
-def _check_name(what: str, name: str) -> None:
-    """Raises ValueError for a name that no DBC may have; attributes for long names can hold anything."""
-    if _IDENTIFIER.fullmatch(name) is None:
-        said = "letters, digits and _, at most 128 of them, a digit not first"
-        raise ValueError(f"the {what} named {shown(name, LONGEST_NAME)}: a name is {said}")
 
 
 def _database(messages: Iterable[Message]) -> Database:

@@ -7,8 +7,7 @@ from collections import Counter, deque
 from soilbus.can.admission import Counts
 from soilbus.can.channels import Reason
 
-WRONG_CHECKSUMS = 0.05
-"""Share of a message's frames from which wrong checksums are said: where `check --log` warns; a good bus has none."""
+WRONG_CHECKSUMS = 0.05  # share of a message's frames from which wrong checksums are said; a good bus has none
 SPAN = 10.0  # time [s] over which a service counts them: a default window
 
 MEANING = {

@@ -22,8 +22,7 @@ from soilbus.can.validity import CodeRule, rule_of
 
 TWICE = 0.002  # seconds within which a frame that equals the one before it is that frame once more: cycles are longer
 
-COUNTER_ERRORS = 5
-"""Net errors of a counter [frames] from which its message is not trusted (opendbc, `MAX_BAD_COUNTER`)."""
+COUNTER_ERRORS = 5  # net errors of a counter [frames] from which its message is not trusted (opendbc, MAX_BAD_COUNTER)
 
 _NO_FRAME = (-math.inf, -1, b"")
 
@@ -62,14 +61,12 @@ class Inbox:
     lock: SourceLock | None
     checksum_byte: int | None
     frames: list[Frame] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)
-    """Stamps [s] of frames that came after others which are stamped much later."""
+    late: list[float] = field(default_factory=list)  # stamps [s] of frames that came after much later ones
     last_t: float = -math.inf
     last_id: int = -1
     last_counter: int = -1
     last_data: bytes = b""
-    counter_errors: int = 0
-    """Frames whose counter did not go on by one, less those whose counter did; from 0 to COUNTER_ERRORS."""
+    counter_errors: int = 0  # frames whose counter did not go on by one, less those whose did, to COUNTER_ERRORS
     is_untrusted: bool = False  # whether the errors have reached COUNTER_ERRORS and are not back at 0 yet
     untrusted: Mask | None = None  # which frames of the last batch came while the message was not trusted
     last_frame: tuple[float, int, bytes] = _NO_FRAME

@@ -20,8 +20,7 @@ from soilbus.words import one_line, shown
 
 CHANNEL_SCAN_FRAMES = 2000  # frames of a log in which its channels are looked for: several seconds of a bus
 LEAST_FRAME = 16  # bytes of a frame in memory at least: what the packed bytes of a log are compared with
-MOST_BACKWARDS = 0.1
-"""Share of frames that may be stamped before the one before: two channels merged have some, relative stamps half."""
+MOST_BACKWARDS = 0.1  # share of stamps that may go back: two channels merged have some, relative stamps half
 LEAST_STAMPS = 20  # frames from which stamps are judged
 
 
