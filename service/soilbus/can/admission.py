@@ -23,12 +23,8 @@ from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_va
 
 OUT_OF_ORDER = 0.1  # seconds by which a frame may be stamped before an earlier one: drivers hand them over in bunches
 CLOCK_STEP = 1.0  # the same, above which the clock was set and the new time is believed
-LONGEST_GAP = (
-    60.0  # seconds without a mapped frame after which a new recording begins: the bus slept, a clock was set
-)
-LAST_TIME = (
-    1e10  # stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move
-)
+LONGEST_GAP = 60.0  # seconds without a mapped frame after which a new recording begins: the bus slept, a clock was set
+LAST_TIME = 1e10  # stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move
 MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31

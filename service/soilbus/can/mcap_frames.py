@@ -19,20 +19,18 @@ from soilbus.files import LIMITS, within_ratio
 
 _STAMP = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}}}
 _CHANNEL = {"type": "string", "description": "channel of the bus"}
-FRAME_SCHEMA = {
-    "title": "can_msgs/Frame",
-    "type": "object",
-    "properties": {
-        "header": {"type": "object", "properties": {"stamp": _STAMP, "frame_id": _CHANNEL}},
-        "id": {"type": "integer", "description": "identifier, without flags"},
-        "is_rtr": {"type": "boolean"},
-        "is_extended": {"type": "boolean"},
-        "is_error": {"type": "boolean"},
-        "dlc": {"type": "integer", "description": "bytes of data"},
-        "data": {"type": "array", "items": {"type": "integer"}},
-    },
-    "required": ["header", "id", "is_rtr", "is_extended", "is_error", "dlc", "data"],
+_PROPERTIES = {
+    "header": {"type": "object", "properties": {"stamp": _STAMP, "frame_id": _CHANNEL}},
+    "id": {"type": "integer", "description": "identifier, without flags"},
+    "is_rtr": {"type": "boolean"},
+    "is_extended": {"type": "boolean"},
+    "is_error": {"type": "boolean"},
+    "dlc": {"type": "integer", "description": "bytes of data"},
+    "data": {"type": "array", "items": {"type": "integer"}},
 }
+FRAME_SCHEMA = {
+    "title": "can_msgs/Frame", "type": "object", "properties": _PROPERTIES, "required": list(_PROPERTIES)
+}  # fmt: skip
 
 
 def nanoseconds(t: float) -> int:
@@ -46,14 +44,9 @@ def frame_message(channel: str, frame: Frame) -> dict[str, Any]:
     t, identifier, is_extended, data, is_remote, is_error = frame
     sec, nanosec = divmod(nanoseconds(t), 10**9)
     return {
-        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": channel},
-        "id": identifier,
-        "is_rtr": is_remote,
-        "is_extended": is_extended,
-        "is_error": is_error,
-        "dlc": len(data),
-        "data": list(data),
-    }
+        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": channel}, "id": identifier,
+        "is_rtr": is_remote, "is_extended": is_extended, "is_error": is_error, "dlc": len(data), "data": list(data),
+    }  # fmt: skip
 
 
 def mcap_frames(stream: BufferedReader) -> Iterator[Heard]:

@@ -1,7 +1,6 @@
 """Results -> frames: value codes, counter, checksum.
 
-Which value goes into which signal is the caller's business; what happens to a value that
-cannot be sent is decided here, once for all signals, from what the DBC says of them.
+What happens to a value that cannot be sent is decided here, once for all signals, from what the DBC says of them.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checksum_byte, frame_checksum
+from soilbus.can.decode import code_limits
 
 NOT_AVAILABLE, ERROR = "not_available", "error"
 _BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
@@ -85,8 +85,7 @@ def value_codes(signal: Signal) -> ValueCodes:
     """
     if signal.is_float or signal.length > 32:
         raise ValueError(f"{signal.name}: only integer signals up to 32 bits can be sent")
-    least = -(1 << signal.length - 1) if signal.is_signed else 0
-    greatest = least + (1 << signal.length) - 1
+    least, greatest = code_limits(signal)
     names = {str(name): int(code) for code, name in (signal.choices or {}).items()}
     if wide := [name for name, code in names.items() if not least <= code <= greatest]:
         raise ValueError(f"{signal.name}: {', '.join(wide)} of the value table does not fit into {signal.length} bits")
