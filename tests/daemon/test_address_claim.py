@@ -12,13 +12,12 @@ from j1939 import ControllerApplication, ElectronicControlUnit, Name
 from fakes import Bench, drive_messages
 from soilbus.can.dbc_files import output_database
 from soilbus.can.j1939 import name_of
-from soilbus.config import model
-from soilbus.config.model import ConfigError
+from soilbus.config.model import J1939, ConfigError
 from soilbus.daemon.address_claim import AddressClaim
 from soilbus.simulator.reference import reference_configuration
 
 ADDRESS = 0x9A
-OURS = model.J1939(address_claim=True, manufacturer_code=1000, identity_number=7)
+OURS = J1939(address_claim=True, manufacturer_code=1000, identity_number=7)
 CLAIM, CANNOT_CLAIM, REQUEST = 0x18EEFF00 | ADDRESS, 0x18EEFFFE, 0x18EAFFF9
 PATIENCE = 5.0
 """Time [s] after which a test gives up waiting."""
@@ -27,7 +26,7 @@ PATIENCE = 5.0
 class OnBus:
     """A claim of ours on a virtual bus, driven as the loop drives it; keeps what it sent."""
 
-    def __init__(self, channel: str, settings: model.J1939 = OURS) -> None:
+    def __init__(self, channel: str, settings: J1939 = OURS) -> None:
         self.bus = can.Bus(interface="virtual", channel=channel, can_filters=list(AddressClaim.filters))
         self.claim = AddressClaim(settings, ADDRESS)
         self.sent: list[tuple[int, bytes]] = []

@@ -10,15 +10,14 @@ import pytest
 from scipy.integrate import quad
 
 from soilbus.cli.main import main
-from soilbus.config.file import load_config, parse_config
-from soilbus.config.file import machine as reference
+from soilbus.config.file import MACHINES, load_config, parse_config
 from soilbus.simulator.drive import SimulationError, drive
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 
-FOLDER = reference("tractor").parent
+FOLDER = MACHINES
 GRAVITY = 9.80665
 WHEELS = ("FL", "FR", "RL", "RR")
 SOILS = ("loam", "sandy_loam_23_michigan", "north_gower_clayey_loam_46")

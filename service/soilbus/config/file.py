@@ -13,6 +13,10 @@ from soilbus.config.faults import fault_lines, open_lines
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 
+__all__ = [
+    "MACHINES", "found_configuration", "load_config", "located", "machine", "overridden", "parse_config", "shipped_dbc"
+]  # fmt: skip
+
 MAX_FILE_BYTES = 2**20
 """Bytes of a configuration: a thousand times those of a tractor's."""
 _MAX_SHOWN_CHARACTERS = 60

@@ -31,6 +31,12 @@ from pydantic import (
 from soilbus.grouping import grouped
 from soilbus.words import LONGEST_NAME, did_you_mean, shown
 
+__all__ = [
+    "J1939", "Axle", "Bus", "Column", "Columns", "Config", "ConfigError", "Dbc", "Effect", "Estimator", "Form", "Model",
+    "Noise", "NoiseOfChannels", "Output", "Prior", "RunningGear", "Signal", "Signals", "SoilPrior", "Table", "Track",
+    "Traversability", "Vehicle", "Warning", "Wheel",
+]  # fmt: skip
+
 SHORT_BIN = 0.04
 """Length of a bin [s] in which a wheel's slip hardly changes while its load shakes at 1.5 to 3 Hz; evidence at
 `Estimator.bin`."""
@@ -574,9 +580,12 @@ class NoiseOfChannels(_Section):
             raise ValueError("a fixed gain error of this sensor is not estimated: say it in absolute or relative")
         return noise
 
-    def scaled(self, factor: float) -> NoiseOfChannels:
-        """Return the noise of each channel times a factor, which may be 0."""
-        scaled = {name: noise.model_copy(update={part: factor * size for part, size in noise}) for name, noise in self}
+    def scaled(self, factor: float, *parts: str) -> NoiseOfChannels:
+        """Return the noise with these parts (by default all) of each channel times a factor, which may be 0."""
+        scaled = {}
+        for name, noise in self:
+            sizes = {part: factor * size for part, size in noise if part in parts or not parts}
+            scaled[name] = noise.model_copy(update=sizes)
         return self.model_copy(update=scaled)
 
 
