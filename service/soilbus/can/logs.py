@@ -101,7 +101,8 @@ class Log:
             return LogError(f"{self.name}: no such file")
         is_of_file_system = isinstance(error, OSError) and error.errno is not None and not self.channels
         if is_of_file_system or isinstance(error, (MemoryError, ModuleNotFoundError)):
-            why = getattr(error, "strerror", None) or str(error) or "not enough memory to read it"
+            is_full = isinstance(error, MemoryError)
+            why = "not enough memory to read it" if is_full else getattr(error, "strerror", None) or str(error)
             fault = LogError(f"{self.name}: {why}")
             fault.lasting = False
             return fault
