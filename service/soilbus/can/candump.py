@@ -26,7 +26,7 @@ NO_STAMPS = "its lines have no time stamps: record with candump -L, or candump -
 
 # identifiers above 1FFFFFFF carry flags
 _PLAIN_LINE = re.compile(
-    r"\(([0-9]++\.[0-9]++)\) (\S++) ([0-9A-Fa-f]{3}|[01][0-9A-Fa-f]{7})#([0-9A-Fa-f]++)(?: [RT])?\n?"
+    r"\(([0-9]+\.[0-9]+)\) (\S+) ([0-9A-Fa-f]{3}|[01][0-9A-Fa-f]{7})#([0-9A-Fa-f]+)(?: [RT])?\n?"
 ).fullmatch
 _STAMP = r"\s*+\(\s*+(?P<date>\d{4}-\d\d-\d\d\s++)?(?P<time>[\d:.]++)\)\s++"
 _LOG_LINE = re.compile(_STAMP + r"(?P<channel>\S++)\s++(?P<id>[0-9A-Fa-f]{3,8})#(?P<rest>.*)", re.DOTALL)
