@@ -195,10 +195,7 @@ class LiveBus:
         self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
 
     def receive(self, timeout: float) -> Received | can.Message | None:
-        """Return the next frame for us; None after `timeout` [s], or where the bus is away.
-
-        Whatever a driver raises that tells of no failure of the bus is one frame that it could not read.
-        """
+        """Return the next frame for us; None after `timeout` [s], or where the bus is away or garbles a frame."""
         self.found_nothing = True
         if self._wire is None:
             self._reopen()

@@ -1,7 +1,6 @@
 """The checksum of frames that others act on: CRC-8 SAE J1850 over identifier and payload.
 
-The identifier goes in first, so that a frame relayed under a wrong identifier is refused as
-well as one with a wrong payload.
+The identifier goes in first, so that a frame relayed under a wrong identifier is refused, too.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ from cantools.database.can import Message
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-COUNTER = "Counter"
-CHECKSUM = "Checksum"
+COUNTER, CHECKSUM = "Counter", "Checksum"
 """Names of the signals that make a frame checkable."""
 
 _ID_BYTES = 4

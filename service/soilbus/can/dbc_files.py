@@ -15,7 +15,6 @@ from cantools.database.can import Database, Message
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
 from soilbus.can.columns import column_database, mapped_columns, mapped_signals
 from soilbus.can.dbc_text import check_multiplexers, of_messages
-from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
 from soilbus.config.model import Config, ConfigError
@@ -145,7 +144,7 @@ def _read(path: Path, names: set[str] | None = None) -> Database:
         text = raw.decode("cp1252", errors="replace")
     check_multiplexers(text)
     if names is not None:
-        text = of_messages(text, names, lambda identifier: pgn_of(identifier) in STANDARD_PGNS)
+        text = of_messages(text, names)
     database = _parsed(text)
     if names is None and not database.messages:
         raise ValueError("no message in it")

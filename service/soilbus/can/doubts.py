@@ -18,10 +18,7 @@ MEANING = {
 
 
 def doubts(received: Counter[str], refused: Counter[tuple[str, Reason]]) -> dict[str, str]:
-    """Return a line for each message with a second sender or with many wrong checksums, by message and reason.
-
-    `received` are frames by message, `refused` those by message and reason.
-    """
+    """Return a line for each message with a second sender or with many wrong checksums, by message and reason."""
     lines = {}
     for (name, reason), n in sorted(refused.items()):
         share = n / max(received[name], n)

@@ -50,10 +50,9 @@ def name_of(unit: J1939) -> int:
 
 @dataclass(slots=True)
 class SourceLock:
-    """Lock on one source address of a parameter group.
+    """Lock on the first source heard of a parameter group, until it is silent for `patience` [s].
 
-    The first source heard counts until it is silent for `patience` [s]; `own`, the address that
-    the DBC names, takes over whenever it talks.
+    `own`, the address that the DBC names, takes over whenever it talks.
     """
 
     own: int

@@ -25,13 +25,10 @@ LEAST_STAMPS = 20  # frames from which stamps are judged
 
 
 class LogError(Exception):
-    """Error of a log that cannot be read to its end; `windows` ended before the damage.
+    """Error of a log that cannot be read to its end."""
 
-    `lasting` is False where the fault is of the machine that reads it, not of what is in the log.
-    """
-
-    windows = 0
-    lasting = True
+    windows = 0  # that ended before the damage
+    lasting = True  # False where the fault is of the machine that reads it, not of what is in the log
 
     def __init__(self, text: str) -> None:
         super().__init__(shown(text))
@@ -83,10 +80,7 @@ class Log:
         return ""
 
     def frames(self) -> Iterator[Frame]:
-        """Yield its frames.
-
-        Raises LogError where it is missing, no log of frames, damaged, made to fill the memory, or has not the channel.
-        """
+        """Yield its frames; LogError where it is no whole log of frames, or has not the channel."""
         try:
             yield from self._frames()
         except Exception as error:  # readers raise all kinds on a damaged file
