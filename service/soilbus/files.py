@@ -43,8 +43,6 @@ class Limits:
     """Characters of a line: a frame of CAN FD takes 200, a comment in a log seldom a thousand."""
     block: int = 64 * 2**20
     """Bytes of a block that its format unpacks at once.  BLF and MF4 writers use 128 KiB to 4 MiB."""
-    dictionary: int = 192 * 2**20
-    """Bytes that a decoder of xz may need; `xz -9` asks for 65 MiB.  That of zstd takes 128 MiB by itself."""
     whole: int = 128 * 2**20
     """Unpacked bytes of a file that must be in memory as a whole: a table of 10 million cells, 1 GB as objects."""
 
@@ -160,14 +158,16 @@ class _Unpacked(io.RawIOBase):
         self._read: Callable[[int], bytes] = packed.read
         if self.packing == "gzip":
             self._read = gzip.GzipFile(fileobj=packed).read1
+        elif self.packing == "bzip2":
+            self._read = bz2.BZ2File(packed).read1
+        elif self.packing == "xz":
+            self._read = lzma.LZMAFile(packed).read1  # type: ignore[arg-type]  # noqa: SIM115
         elif self.packing == "zstd":
             try:
                 plain = import_module("pyarrow").input_stream(packed, compression="zstd")
             except ModuleNotFoundError:
                 raise OSError(errno.ENOSYS, "a file packed by zstd needs the extra soilbus[tables]") from None
             self._read = lambda size: plain.read(min(size, _PIECE))
-        elif self.packing:
-            self._read = _decoded(packed, self.packing)
 
     def readable(self) -> bool:
         return True
@@ -189,32 +189,6 @@ class _Unpacked(io.RawIOBase):
 
 
 _MARKS = {"gzip": b"\x1f\x8b", "bzip2": b"BZh", "xz": b"\xfd7zXZ\0", "zstd": b"\x28\xb5\x2f\xfd"}
-
-
-def _decoded(packed: _Counted, kind: str) -> Callable[[int], bytes]:
-    """A function that reads plain bytes of bzip2 or xz, of one stream or several, with a decoder of bounded memory."""
-
-    def new() -> Any:
-        return lzma.LZMADecompressor(memlimit=LIMITS.dictionary) if kind == "xz" else bz2.BZ2Decompressor()
-
-    decoder = new()
-
-    def read(size: int) -> bytes:
-        nonlocal decoder
-        plain = b""
-        while not plain:
-            more = b""
-            if decoder.eof:
-                more = (decoder.unused_data or packed.read(_BUFFER)).lstrip(b"\0")
-                if not more:
-                    return b""
-                decoder = new()
-            elif decoder.needs_input and not (more := packed.read(_BUFFER)):
-                raise EOFError("cut off")
-            plain = decoder.decompress(more, size)
-        return plain
-
-    return read
 
 
 _numbers = count()

@@ -5,11 +5,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import itertools
+import math
 import socket
 from pathlib import Path
 
 import can
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus, ask_for_buffer, open_bus
@@ -23,6 +26,8 @@ BUFFER = 4 * 2**20
 """Bytes that systemd/soilbus.sysctl lets the service have."""
 BACK_WITHIN = 1.15
 """Seconds within which a bus that is back must be found, so that frames go out again in two."""
+CYCLE = 0.1
+"""Seconds after which the next frame of an identifier is made: one that waited longer says nothing."""
 AGAIN_WITHIN = 0.01
 """Seconds within which frames that wait for room are tried again: a tenth of their cycle."""
 
@@ -272,3 +277,69 @@ def test_only_silence_counts_as_nothing_to_take():
         found_nothing.append(bus.found_nothing)
     assert found_nothing == [False, False, True]
     assert (bus.counts.foreign, bus.counts.error_frames) == (1, 1)
+
+
+def numbered(identifier: int, content: int = 0) -> Frame:
+    return Frame(identifier, True, bytes((content,)))
+
+
+def full() -> tuple[LiveBus, ScriptedBus, FakeClock]:
+    """A bus without room, its wire and the clock."""
+    clock = FakeClock()
+    wire = ScriptedBus(clock)
+    wire.full_until = math.inf
+    bus = live(lambda: wire, clock)
+    bus.open()
+    return bus, wire, clock
+
+
+def given_room(bus: LiveBus, wire: ScriptedBus) -> list[tuple[int, int]]:
+    """Identifiers and contents of what goes out while there is room."""
+    before, wire.full_until = len(wire.sent), 0.0
+    bus.receive(0.0)
+    wire.full_until = math.inf
+    return [(message.arbitration_id, message.data[0]) for _, message in wire.sent[before:]]
+
+
+def test_a_newer_frame_takes_the_place_and_the_turn_of_the_older():
+    bus, wire, _ = full()
+    for identifier, content in ((1, 0), (2, 0), (1, 7)):
+        bus.send(numbered(identifier, content))
+    assert given_room(bus, wire) == [(1, 7), (2, 0)]
+    assert bus.counts.dropped == 1
+
+
+def test_late_frames_are_dropped():
+    bus, wire, clock = full()
+    bus.send(numbered(1))
+    clock.now += 0.05
+    bus.send(numbered(2))
+    clock.now += CYCLE - 0.03
+    assert given_room(bus, wire) == [(2, 0)]
+    bus.send(numbered(3))
+    clock.now += CYCLE + 0.01
+    assert given_room(bus, wire) == []
+    assert bus.counts.dropped == 2
+
+
+@given(st.lists(st.integers(0, 5) | st.sampled_from(["room", "away"]), max_size=60), st.floats(0.0, 0.05))
+def test_every_frame_is_sent_or_dropped_and_none_is_sent_late_or_after_a_newer_one(actions, pause):
+    bus, wire, clock = full()
+    newest: dict[int, int] = {}
+    made: dict[int, float] = {}
+    put = 0
+    for action in actions:
+        clock.now += pause
+        if action == "room":
+            for identifier, content in given_room(bus, wire):
+                assert content == newest[identifier] % 256
+                assert clock.now - made[identifier] <= CYCLE + 0.001
+        elif action == "away":
+            bus.close()
+            bus.open()
+        else:
+            put += 1
+            newest[action], made[action] = put, clock.now
+            bus.send(numbered(action, put % 256))
+    bus.close()
+    assert put == bus.counts.sent + bus.counts.dropped == len(wire.sent) + bus.counts.dropped

@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator
-from itertools import chain
 
 import can
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from soilbus.can.candump import Frame, candump_batches, frame_of, whole
+from soilbus.can.candump import Frame, frame_of, whole
+from soilbus.can.candump import candump_frames as heard_in
 
 PLAIN = "(1700000000.000266) can0 18FF2211#025415B303000000\n"
 
@@ -35,7 +35,7 @@ garbage = st.text("()#.R 0129AFcan\t", max_size=40).map("{}\n".format)
 
 
 def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
-    return chain.from_iterable(frames for _, frames in candump_batches(lines))
+    return (frame for _, frame in heard_in(lines))
 
 
 def outcome(frames: Iterator[Frame]) -> tuple[list[Frame], type[Exception] | None, str]:

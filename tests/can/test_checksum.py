@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from crccheck.crc import Crc8SaeJ1850
 from hypothesis import given
 from hypothesis import strategies as st
 
-from soilbus.can.checksum import column_checksums, crc8, frame_checksum
+from soilbus.can.checksum import column_checksums, frame_checksum
 
 
 def test_published_check_value() -> None:
-    assert crc8(b"123456789") == 0x4B
-
-
-@given(st.binary(max_size=70))
-def test_equals_crccheck(data: bytes) -> None:
-    assert crc8(data) == Crc8SaeJ1850.calc(data)
+    """Of "123456789", the first four bytes as identifier."""
+    assert frame_checksum(int.from_bytes(b"1234", "little"), b"56789\0", 5) == 0x4B
 
 
 @given(st.integers(0, 2**29 - 1), st.binary(min_size=1, max_size=64), st.data())

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.can.dbc_text import message_names, of_messages
+from soilbus.can.dbc_text import of_messages
 from soilbus.can.mapping import channels_of
 from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import ConfigError
@@ -81,5 +81,4 @@ def test_a_name_that_is_not_there_is_still_told_its_neighbours():
 
 def test_a_message_that_no_parser_understands_is_left_to_the_parser():
     text = 'BO_ 1 Good: 8 A\n SG_ X : 0|8@1+ (1,0) [0|0] "" A\n\nBO_ 2 Bad 8 A\nBO_ 3 Else: 8 A\n'
-    assert message_names(text) == {"Good", "Else"}
-    assert of_messages(text, {"Good"}, lambda _: False) == text.replace("BO_ 3 Else: 8 A\n", "")
+    assert of_messages(text, {"Good"}) == text.replace("BO_ 3 Else: 8 A\n", "")

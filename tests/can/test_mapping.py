@@ -406,7 +406,7 @@ def test_a_percentage_times_its_reference_is_a_torque_at_the_shaft(tmp_path):
         ({"torque": {"signal": "Motor.Torque", "reference_torque": 800.0}}, "Torque is in Nm; with"),
         ({"torque": {"signal": "Wheel.Bare", "reference_torque": 800.0}}, "Bare is in no unit; with"),
         ({"speed": {"signal": "Wheel.Grade", "reference_torque": 800.0}}, "no meaning for speed"),
-        ({"torque": "Wheel.Grade"}, "or for a torque its reference_torque"),
+        ({"torque": "Wheel.Grade"}, "Grade is in %, a percentage: give its reference_torque [N m]"),
     ],
 )
 def test_a_reference_torque_is_for_a_percentage_of_torque(tmp_path, wheel, fault):
@@ -426,7 +426,7 @@ def test_the_pressure_of_air_springs_carries_the_load(tmp_path):
 @pytest.mark.parametrize(
     ("quantity", "mapped", "line"),
     [
-        ("load", "Air.P", "P is in kPa, a pressure: give effective_area [m^2]"),
+        ("load", "Air.P", "P is in kPa, a pressure: give its effective_area [m^2]"),
         ("torque", {"signal": "Air.P", "effective_area": 0.06}, "effective_area has no meaning for torque"),
         ("load", {"signal": "Air.F", "effective_area": 0.06}, "F is in N; with effective_area it must be a pressure"),
         ("torque", "Air.I", "I is in A, a current: give its torque_constant [N m/A]"),

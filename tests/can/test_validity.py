@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn
-from soilbus.can.validity import REASONS, in_si, judge_codes, judge_validity, meaning, rule_of
+from soilbus.can.validity import in_si, judge_codes, judge_validity, meaning, rule_of
 
 SPEED_MAX = 64.255
 NA, ERROR, RESERVED, OUT = Reason.NOT_AVAILABLE, Reason.ERROR, Reason.RESERVED, Reason.OUT_OF_RANGE
@@ -35,7 +35,7 @@ def verdicts(s: Signal, codes: list[Any]) -> list[Reason | None]:
 
 
 def reasons(verdict: Any) -> list[Reason | None]:
-    return [REASONS[v - 1] if v else None for v in verdict.tolist()]
+    return [[*Reason][v - 1] if v else None for v in verdict.tolist()]
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_absent_validity_signal_vouches_for_nothing() -> None:
 
 def test_implausible_only_where_nothing_else_is_wrong() -> None:
     verdict = np.zeros(4, dtype=np.uint8)
-    verdict[3] = REASONS.index(ERROR) + 1
+    verdict[3] = [*Reason].index(ERROR) + 1
     value = in_si(channel(factor=2.0, offset=1.0, low=0.0, high=5.0), np.array([0, 2, 3, 300]), verdict)
     assert value.tolist() == [1.0, 5.0, 7.0, 601.0]
     assert reasons(verdict) == [None, None, Reason.IMPLAUSIBLE, ERROR]

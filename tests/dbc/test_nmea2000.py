@@ -8,9 +8,10 @@ import cantools
 import numpy as np
 import pytest
 
+from soilbus.can.channels import Reason
 from soilbus.can.decode import ColumnDecoder
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
-from soilbus.can.validity import REASONS, judge_codes, rule_of
+from soilbus.can.validity import judge_codes, rule_of
 
 DATABASE = cantools.database.load_file(Path(__file__).resolve().parents[2] / "dbc/nmea2000.dbc", strict=True)
 MESSAGE = DATABASE.get_message_by_name("PositionRapidUpdate")
@@ -25,7 +26,7 @@ def verdicts(payload: str) -> list[str]:
         judge_codes(rule_of(MESSAGE.get_signal_by_name(name)), columns[name].raw, columns[name].physical)[0]
         for name in ("Latitude", "Longitude")
     ]
-    return [str(REASONS[v - 1]) if v else "" for v in found]
+    return [str([*Reason][v - 1]) if v else "" for v in found]
 
 
 def test_a_position_off_the_american_coast():

@@ -1,7 +1,6 @@
 """Which frames count: all of a frame or nothing, each refusal with a reason and a counter.
 
-`feed` only files a frame under its message; everything else happens in `take` on whole
-columns, once a hop.
+`feed` only files a frame under its message; all else happens in `take` on whole columns, once a hop.
 """
 
 from __future__ import annotations
@@ -14,47 +13,30 @@ from typing import Any
 
 import numpy as np
 from cantools.database.can import Database, Message
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
-from soilbus.can.inbox import (
-    Batch,
-    Data,
-    Frame,
-    Inbox,
-    checksum_right,
-    counter_moved,
-    inbox_of,
-    not_twice,
-    of_one_sender,
-    popped,
-    time_forward,
-)
+from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, inbox_of, popped
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 
-OUT_OF_ORDER = 0.1
-"""Seconds by which a frame may be stamped earlier than one that came before it: drivers hand frames over in bunches."""
-CLOCK_STEP = 1.0
-"""The same, above which the clock was set and the new time is believed."""
-LONGEST_GAP = 60.0
-"""Seconds without a mapped frame after which a new recording begins: the bus slept, or the clock was set ahead."""
-LAST_TIME = 1e10
-"""Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
+OUT_OF_ORDER = 0.1  # seconds by which a frame may be stamped before an earlier one: drivers hand them over in bunches
+CLOCK_STEP = 1.0  # the same, above which the clock was set and the new time is believed
+LONGEST_GAP = 60.0  # seconds without a mapped frame after which a new recording begins: the bus slept, a clock was set
+LAST_TIME = 1e10  # stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move
 MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31
 _FOLLOWS = LONGEST_GAP + OUT_OF_ORDER
-_NONE: NDArray[np.float64] = np.empty(0)
+_NONE: Array = np.empty(0)
 
 
 @dataclass(slots=True)
 class Counts:
     """Frames since the start: by message name, by (message name, reason), by identifier.
 
-    Extended identifiers have bit 31 set in `unknown_ids`, which lists the first
-    MAX_LISTED_UNKNOWN identifiers; `unknown` counts all.
+    `unknown_ids` lists the first MAX_LISTED_UNKNOWN, extended ones with bit 31; `unknown` counts all.
     """
 
     received: Counter[str] = field(default_factory=Counter)
@@ -63,8 +45,7 @@ class Counts:
     unknown: int = 0
     unknown_ids: Counter[int] = field(default_factory=Counter)
     error_frames: int = 0
-    elsewhere: int = 0
-    """Frames of other channels of a log."""
+    elsewhere: int = 0  # frames of other channels of a log
     clock_steps: int = 0
     senders: dict[str, set[int]] = field(default_factory=dict)
     """Source addresses of a message by its name, where several sent it and none of them is the DBC's."""
@@ -76,22 +57,17 @@ class Counts:
 
 
 class Admission:
-    """Collects frames and hands out admitted samples.
+    """Collects frames and hands out the admitted samples of `channels`, whose messages `database` describes.
 
-    `channels` are what is wanted, `database` describes their messages.  `checked` names the
-    messages whose Counter and Checksum (see `can.checksum`) must be right; other makers' check
-    schemes are not ours to judge, so a message not named is not checked.
+    `checked` names the messages whose Counter and Checksum (see `can.checksum`) must be right.  A message of a standard
+    parameter group (`j1939.STANDARD_PGNS`) is heard from any source and priority, one source at a time, unless the
+    database has several messages of that group.
 
-    A message of a standard parameter group (`j1939.STANDARD_PGNS`) is heard from any source and
-    priority, one source at a time, unless the database has several messages of that group.
+    `at_break` is called before a frame is filed that does not follow the ones before it: its clock was set back, then
+    what is not taken is refused, or there was none for LONGEST_GAP.
 
-    `at_break` is called when a frame comes that does not follow the ones before it (its clock was
-    set back, or there was none for LONGEST_GAP), before it is filed: what is not taken then is
-    refused where the clock was set back.
-
-    Raises ValueError when two messages share an identifier, when a checked message has no
-    Counter or no byte-aligned 8-bit Checksum, or as `ColumnDecoder` does; KeyError for a message
-    or signal that the database does not have.
+    Raises ValueError when two messages share an identifier or a checked one cannot be checked, or as `ColumnDecoder`
+    does; KeyError for a message or signal that is not in the database.
     """
 
     def __init__(self, channels: Iterable[Channel], database: Database, checked: Collection[str] = ()) -> None:
@@ -136,9 +112,8 @@ class Admission:
     def take(self, until: float = math.inf) -> Decoded:
         """Return the samples of all frames filed so far with t < until [s]; later frames stay.
 
-        Every channel has a column, perhaps empty; times do not decrease within it.  A refused
-        frame counts as a refused sample of each of its channels; those of a source that is not
-        listened to, of remote frames and of frames without a time are in `untimed`.
+        Every channel has a column, perhaps empty, whose times do not decrease.  A refused frame counts as a refused
+        sample of each of its channels; those of another source, of remote frames and without a time are in `untimed`.
         """
         out = Decoded(untimed=self._untimed)
         self._untimed = Counter()
@@ -168,12 +143,10 @@ class Admission:
         """Return the filters for python-can that pass exactly the frames of the mapped messages."""
         filters: list[dict[str, Any]] = []
         for inbox in self._inboxes:
-            message = inbox.message
-            mask = 0x1FFFFFFF if message.is_extended_frame else 0x7FF
-            if inbox.lock is not None:
-                mask = group_mask(message.frame_id)
-            extended = message.is_extended_frame
-            filters.append({"can_id": message.frame_id & mask, "can_mask": mask, "extended": extended})
+            number, extended = inbox.message.frame_id, inbox.message.is_extended_frame
+            whole = 0x1FFFFFFF if extended else 0x7FF
+            mask = whole if inbox.lock is None else group_mask(number)
+            filters.append({"can_id": number & mask, "can_mask": mask, "extended": extended})
         return filters
 
     def _inbox_of_group(self, arbitration_id: int, extended: bool) -> Inbox | None:
@@ -235,12 +208,9 @@ class Admission:
     def _checked_batch(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> Batch | None:
         """The frames that pass every frame-level check; None when there are none."""
         length = inbox.message.length
-        times, ids, datas = zip(*frames, strict=True)
-        good = frames
-        if set(map(len, datas)) != {length}:
-            good = [f for f in frames if len(f[2]) == length]
-            bad = np.array([f[0] for f in frames if len(f[2]) != length])
-            self._refuse(inbox, bad, Reason.WRONG_LENGTH, out)
+        good = [f for f in frames if len(f[2]) == length]
+        if len(good) < len(frames):
+            self._refuse(inbox, np.array([f[0] for f in frames if len(f[2]) != length]), Reason.WRONG_LENGTH, out)
         if inbox.lock is not None:
             heard = _of_locked_source(inbox.lock, good)
             self._refuse_untimed(inbox, len(good) - len(heard), Reason.WRONG_SOURCE)
@@ -249,17 +219,10 @@ class Admission:
             good = heard
         if not good:
             return None
-        if good is not frames:
-            times, ids, datas = zip(*good, strict=True)
+        times, ids, datas = zip(*good, strict=True)
         payload = np.frombuffer(b"".join(datas), dtype=np.uint8).reshape(-1, length)
         batch = Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
-        for check, reason in (
-            (checksum_right, Reason.BAD_CHECKSUM),
-            (time_forward, Reason.TIME_BACKWARDS),
-            (counter_moved, Reason.BAD_COUNTER),
-            (of_one_sender, Reason.SECOND_SENDER),
-            (not_twice, Reason.DUPLICATE),
-        ):
+        for reason, check in CHECKS.items():
             mask = check(inbox, batch)
             if mask is None or mask.all():
                 continue
@@ -269,7 +232,7 @@ class Admission:
             batch = batch.where(mask)
         return batch
 
-    def _refuse(self, inbox: Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
+    def _refuse(self, inbox: Inbox, t: Array, reason: Reason, out: Decoded) -> None:
         self.counts.refused[inbox.message.name, reason] += len(t)
         for channel in inbox.channels:
             before = out.refused.get((channel.name, reason))
@@ -306,14 +269,9 @@ def _of_locked_source(lock: SourceLock, frames: list[Frame]) -> list[Frame]:
 
 
 def _judge(
-    channel: Channel,
-    rule: CodeRule,
-    message: Message,
-    t: NDArray[np.float64],
-    columns: dict[str, SignalColumn],
-    out: Decoded,
+    channel: Channel, rule: CodeRule, message: Message, t: Array, columns: dict[str, SignalColumn], out: Decoded
 ) -> None:
-    """Puts one channel's samples into `out`: each one admitted, or refused for one reason."""
+    """Put one channel's samples into `out`: each one admitted, or refused for one reason."""
     column = columns[channel.signal]
     verdict = judge_codes(rule, column.raw, column.physical)
     if channel.valid_signal is not None:

@@ -18,7 +18,6 @@ import can
 
 from soilbus.can import candump
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
-from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
 from soilbus.can.wire import MessageBus, MessageWire, Received, error_number, is_multicast, wire_of
 from soilbus.words import WorkError, one_line
@@ -26,21 +25,15 @@ from soilbus.words import WorkError, one_line
 log = logging.getLogger(__name__)
 
 FIRST_BACK_OFF = 0.1
-LONGEST_BACK_OFF = 1.0
-"""Reopening is tried at least this often [s], so that a bus that is back is found in time."""
-
-RECEIVE_BUFFER = 4 * 2**20
-"""Bytes asked for frames that wait for us; the kernel takes as many again for itself."""
+LONGEST_BACK_OFF = 1.0  # reopening is tried at least this often [s], so that a bus that is back is found in time
+RECEIVE_BUFFER = 4 * 2**20  # bytes asked for frames that wait for us; the kernel takes as many again for itself
 SO_RCVBUFFORCE = 33  # which Python does not name
-RETRY = 0.005
-"""Longest wait for a frame [s] while frames of ours wait for room."""
-GARBLED_FOR = 1.0
-"""A driver that for so long [s] hands out nothing but what it cannot read is opened again: it may never come right."""
-SAY_AGAIN = 60.0
-"""A fault that lasts is said in the journal this often [s]."""
+LATE = 0.1  # age [s] at which a frame that did not get out is dropped: its successor is newer
+RETRY = 0.005  # longest wait for a frame [s] while frames of ours wait for room
+GARBLED_FOR = 1.0  # a driver that for so long [s] reads nothing that it understands is opened again
+SAY_AGAIN = 60.0  # a fault that lasts is said in the journal this often [s]
 
 _NO_ROOM = {errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK}
-
 _KERNEL_WITHOUT_CAN = {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT}
 
 
@@ -53,12 +46,9 @@ class BusError(WorkError):
 
 
 def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
-    """Return the bus that the section [bus] describes, with kernel filters where it has a kernel.
-
-    Raises BusError with one line.
-    """
+    """Return the bus of the section [bus], with kernel filters where it has a kernel; BusError with one line."""
     try:
-        bus = can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
+        bus = can.Bus(**settings, can_filters=filters)
         _prepare(bus)
         return bus
     except Exception as error:  # drivers raise all kinds
@@ -78,26 +68,19 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
 
 
 def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[candump.Frame]:
-    """Yield the frames that the bus carries from now on; nothing is sent.
-
-    Raises BusError for a bus that cannot be opened or goes away.
-    """
-    bus = open_bus(settings)
+    """Yield the frames that the bus carries from now on; BusError where it cannot be opened or goes away."""
     try:
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            try:
-                message = bus.recv(left)
-            except (OSError, can.CanError) as error:
-                raise bus_fault(settings, error) from None
-            if message is not None:
-                yield candump.frame_of(message)
-    finally:
-        bus.shutdown()
+        with open_bus(settings) as bus:
+            end = time.monotonic() + seconds
+            while (left := end - time.monotonic()) > 0.0:
+                if (message := bus.recv(left)) is not None:
+                    yield candump.frame_of(message)
+    except (OSError, can.CanError) as error:
+        raise bus_fault(settings, error) from None
 
 
 def _prepare(bus: can.BusABC) -> None:
-    """Raises OSError for an interface that is down: the kernel binds to it all the same."""
+    """Raise OSError for an interface that is down: the kernel binds to it all the same."""
     if is_multicast(bus):
         with socket.socket(fileno=os.dup(bus.fileno())) as same:
             ask_for_buffer(same)
@@ -111,10 +94,7 @@ def _prepare(bus: can.BusABC) -> None:
 
 
 def ask_for_buffer(own: socket.socket) -> None:
-    """Ask for RECEIVE_BUFFER (socket(7)): an administrator gets all of it, others what net.core.rmem_max allows.
-
-    Raises OSError for a socket that is closed.
-    """
+    """Ask for RECEIVE_BUFFER (socket(7)): an administrator gets all of it, others what net.core.rmem_max allows."""
     own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     with suppress(OSError):  # it takes CAP_NET_ADMIN
         own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
@@ -129,21 +109,17 @@ class BusCounts:
     dropped: int = 0
     overruns: int = 0
     error_frames: int = 0
-    garbled: int = 0
-    """Frames that the driver could not read: of a serial adapter, say, that lost a character."""
-    foreign: int = 0
-    """Frames of others under our identifiers."""
-    lost: int = 0
-    """How often the bus went away."""
+    garbled: int = 0  # frames that the driver could not read: of a serial adapter, say, that lost a character
+    foreign: int = 0  # frames of others under our identifiers
+    lost: int = 0  # how often the bus went away
     reopened: int = 0
 
 
 class LiveBus:
-    """A bus that may go and come back.
+    """A bus that may go and come back: while it is away `receive` returns nothing and `send` drops.
 
-    Nothing in here blocks longer than asked.  While the bus is away `receive` returns
-    nothing and `send` drops.  `clock` is monotonic.  `own` are the identifiers that we send
-    (with: is it extended); a data frame that comes with one of them is somebody else's and is not handed on.
+    Nothing blocks longer than asked.  `clock` is monotonic.  `own` are the identifiers that we send (with: is it
+    extended); a data frame that comes with one of them is somebody else's and is not handed on.
     """
 
     def __init__(
@@ -155,16 +131,13 @@ class LiveBus:
     ) -> None:
         self.fault = "not opened yet"
         self.state = BusState.UNKNOWN
-        self.last_foreign = -math.inf
-        """When the last foreign frame came, by `clock` [s]."""
-        self.found_nothing = True
-        """Whether the last `receive` returned None because no frame of any kind waited."""
+        self.last_foreign = -math.inf  # when the last foreign frame came, by `clock` [s]
+        self.found_nothing = True  # whether the last `receive` returned None because no frame of any kind waited
         self._opener, self._clock, self._sleep, self._own = opener, clock, sleep, frozenset(own)
         self._counts = BusCounts()
         self._wire: MessageWire | None = None
-        self._outbox = Outbox()
+        self._waiting: dict[int, tuple[Frame, float]] = {}  # for room, since when: the newest of each identifier
         self._overruns_before = 0  # of wires that are closed, and what the controller reported
-        self._refused_while_away = 0
         self._next_try = -1.0
         self._back_off = FIRST_BACK_OFF
         self._garbled_since: float | None = None
@@ -177,16 +150,14 @@ class LiveBus:
 
     @property
     def holds_seconds(self) -> bool:
-        """Whether the frames of a few seconds find room while nobody takes them."""
+        """Whether frames of a few seconds find room while nobody takes them."""
         return self._wire is not None and self._wire.room >= RECEIVE_BUFFER
 
     @property
     def counts(self) -> BusCounts:
         """Counts of the bus since the start."""
-        counts = self._counts
-        counts.dropped = self._outbox.dropped + self._refused_while_away
-        counts.overruns = self._overruns_before + (self._wire.overruns if self._wire is not None else 0)
-        return counts
+        self._counts.overruns = self._overruns_before + (self._wire.overruns if self._wire is not None else 0)
+        return self._counts
 
     def open(self) -> None:
         """Open the bus now; raise BusError where that fails."""
@@ -198,44 +169,40 @@ class LiveBus:
             raise BusError(f"bus: {one_line(error)}", may_come=True) from None
         self.state, self.fault = BusState.UNKNOWN, ""
 
-    def _reopen(self) -> bool:
-        now = self._clock()
-        if now < self._next_try:
-            return False
+    def _reopen(self) -> None:
+        if self._clock() < self._next_try:
+            return
         try:
             self.open()
         except BusError as error:
             if str(error) != self.fault:
                 log.warning("%s", error)
-            self.fault = str(error)
-            self._wait()
-            return False
+            self._wait(str(error))
+            return
         self._counts.reopened += 1
         log.info("bus is open")
-        return True
 
     def _lost(self, error: Exception) -> None:
         log.warning("bus lost: %s", one_line(error))
-        self.fault = one_line(error)
         self._counts.lost += 1
         self.close()
-        self._wait()
+        self._wait(one_line(error))
 
-    def _wait(self) -> None:
+    def _wait(self, fault: str) -> None:
         """No try for a while, and longer each time until a frame has come."""
+        self.fault = fault
         self._next_try = self._clock() + self._back_off
         self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
 
     def receive(self, timeout: float) -> Received | can.Message | None:
-        """Return the next frame for us; None after `timeout` [s], or where the bus is away.
-
-        Whatever a driver raises that tells of no failure of the bus is one frame that it could not read.
-        """
+        """Return the next frame for us; None after `timeout` [s], or where the bus is away or garbles a frame."""
         self.found_nothing = True
-        if self._wire is None and not self._reopen():
+        if self._wire is None:
+            self._reopen()
+        if self._wire is None:
             self._sleep(min(timeout, max(self._next_try - self._clock(), 0.0)))
             return None
-        if self._outbox:
+        if self._waiting:
             self._flush(self._clock())
             timeout = min(timeout, RETRY)
         if self._wire is None:
@@ -294,19 +261,23 @@ class LiveBus:
     def send(self, frame: Frame) -> bool:
         """Send a frame, or keep it for a moment if there is no room; return whether nothing waits any more.
 
-        A frame is dropped when a newer one of its identifier comes before there is room, when
-        it is late, or when the bus is away.
+        It is dropped when a newer one of its identifier comes first, when it is late, or when the bus is away.
         """
         if self._wire is None:
-            self._refused_while_away += 1
+            self._counts.dropped += 1
             return False
         now = self._clock()
-        self._outbox.put(frame, now)
+        self._counts.dropped += frame.arbitration_id in self._waiting
+        self._waiting[frame.arbitration_id] = frame, now
         return self._flush(now)
 
     def _flush(self, now: float) -> bool:
-        """Send what waits and is not late at `now`, as far as there is room; whether all of it is out."""
-        while self._wire is not None and (frame := self._outbox.first(now)) is not None:
+        """Send what waits and is not late, as far as there is room; whether all of it is out."""
+        for identifier, (frame, made) in list(self._waiting.items()):
+            if self._wire is None or now - made > LATE:
+                self._counts.dropped += 1
+                del self._waiting[identifier]
+                continue
             try:
                 self._wire.send(frame)
             except Exception as error:  # drivers raise all kinds
@@ -315,9 +286,9 @@ class LiveBus:
                 else:
                     self._say(f"send queue full: {one_line(error)}")
                 return False
-            self._outbox.done(frame)
             self._counts.sent += 1
-        return self._wire is not None
+            del self._waiting[identifier]
+        return True
 
     def _say(self, text: str) -> None:
         """Into the journal, the same text once in a while."""
@@ -329,7 +300,8 @@ class LiveBus:
     def close(self) -> None:
         """Close the bus."""
         wire, self._wire = self._wire, None
-        self._outbox.clear()
+        self._counts.dropped += len(self._waiting)
+        self._waiting.clear()
         if wire is not None:
             self._overruns_before += wire.overruns
             try:

@@ -42,12 +42,11 @@ def path_of(message: str, signal: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One quantity and the signal that carries it.
+    """One quantity and the signal that carries it: value in SI = factor * physical value of the DBC + offset.
 
-    `value in SI = factor * physical value of the DBC + offset`; values outside
-    low..high (SI) are implausible.  `valid_signal` (same message) must hold one of
-    `valid_values` (raw codes).  `quantity` is the role, e.g. "torque"; `wheel` the
-    wheel's name or "" for the vehicle.  What a sample reports was true `delay` [s] before its stamp.
+    Values outside low..high (SI) are implausible.  `valid_signal` (same message) must hold one of `valid_values` (raw
+    codes).  `quantity` is the role, e.g. "torque"; `wheel` the wheel's name or "" for the vehicle.  What a sample
+    reports was true `delay` [s] before its stamp; `key` of the configuration maps it.
     """
 
     quantity: str
@@ -63,7 +62,6 @@ class Channel:
     timeout: float | None = None
     delay: float = 0.0
     key: str = ""
-    """Key of the configuration that maps it."""
 
     @property
     def name(self) -> str:

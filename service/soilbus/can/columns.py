@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from typing import Any
 
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
@@ -18,11 +17,11 @@ from cantools.database.conversion import BaseConversion
 from soilbus.can.channels import WHOLE
 from soilbus.can.units import unit_of
 from soilbus.config.model import Config
+from soilbus.config.model import Signal as MappedSignal
 
 _IN_BRACKETS = re.compile(r".*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 _BEHIND = re.compile(r".*?[_ /,]([^\s_,]+)\s*")
-LETTERS = frozenset({"N", "m", "g"})
-"""Units of one letter that may end a column's name ("draft_N"); other single letters number or place a sensor."""
+LETTERS = frozenset({"N", "m", "g"})  # units of one letter that may end a column's name; others number a sensor
 
 
 def unit_in(column: str) -> str:
@@ -45,40 +44,23 @@ def unit_in(column: str) -> str:
 
 
 def column_database(units: Mapping[str, str]) -> Database:
-    """Return the columns of a table as messages, each numbered by its place.
-
-    Parameters
-    ----------
-    units
-        Unit of each column by its name; "" where it is not known.
-    """
+    """Return the columns of a table as messages, each numbered by its place; `units` by name, "" where not known."""
     database = Database(strict=False)
     conversion = BaseConversion.factory(scale=1, offset=0, is_float=True)
     for number, (column, unit) in enumerate(units.items()):
         signal = Signal(WHOLE, 0, 64, "little_endian", True, conversion=conversion, unit=unit or None)
-        database.messages.append(
-            Message(number, column, 8, [signal], is_extended_frame=number >= 1 << 11, strict=False)
-        )
+        is_extended = number >= 1 << 11
+        database.messages.append(Message(number, column, 8, [signal], is_extended_frame=is_extended, strict=False))
     database.refresh()
     return database
 
 
 def mapped_columns(config: Config) -> dict[str, str]:
     """Return the unit of each column that the configuration maps, by its name."""
-    return {
-        one["signal"]: one["unit"] if one["unit"] is not None else unit_in(one["signal"])
-        for one in mapped_signals(config)
-    }
+    return {s.signal: unit_in(s.signal) if s.unit is None else s.unit for s in mapped_signals(config)}
 
 
-def mapped_signals(section: Any) -> Iterator[Mapping[str, Any]]:
-    """Yield the keys of each signal that a configuration or a part of it maps."""
-    if isinstance(section, Config):
-        section = section.model_dump(exclude={"columns", "table", "folder"})
-    if isinstance(section, Mapping):
-        if isinstance(section.get("signal"), str):
-            yield section
-        section = list(section.values())
-    if isinstance(section, list):
-        for part in section:
-            yield from mapped_signals(part)
+def mapped_signals(config: Config) -> Iterator[MappedSignal]:
+    """Yield each signal that a configuration maps."""
+    for part in (config.vehicle, config.signals, *config.axle, *config.wheel):
+        yield from (value for _, value in part or () if isinstance(value, MappedSignal))

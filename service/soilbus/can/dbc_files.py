@@ -14,37 +14,29 @@ from cantools.database.can import Database, Message
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte
 from soilbus.can.columns import column_database, mapped_columns, mapped_signals
-from soilbus.can.dbc_text import check_multiplexers, message_names, of_messages
-from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
+from soilbus.can.dbc_text import check_multiplexers, of_messages
 from soilbus.can.publish import ERROR, NOT_AVAILABLE, Publisher
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 from soilbus.words import LONGEST_NAME, did_you_mean, one_line, shown
 
-LARGEST = 32 * 2**20
-"""Bytes of a DBC file: five times those of one with 10 000 messages."""
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
-"""A name in a DBC: C_identifier of the DBC file format (Vector, version 1.0.5), with its greatest length."""
+LARGEST = 32 * 2**20  # bytes of a DBC file: five times those of one with 10 000 messages
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")  # C_identifier of the DBC file format (Vector, 1.0.5)
 
 
 def load_databases(config: Config, mapped_only: bool = False) -> Database:
     """Return all DBC files of the configuration as one database; with [columns] the mapped columns.
 
     With `mapped_only` messages are left out that can have no say in what is mapped, unless a mapped one is missing.
-
-    Raises ConfigError with a line for each file that is missing or not a DBC, and for each
-    message that two files define differently.
+    Raises ConfigError with a line for each file that is missing or no DBC, and each message defined in two ways.
     """
     if config.columns is not None:
         return column_database(mapped_columns(config))
-    faults: list[str] = []
-    if not config.dbc.input:
-        faults.append("dbc.input: no DBC file given")
+    faults = [] if config.dbc.input else ["dbc.input: no DBC file given"]
     messages: dict[str, tuple[str, Message]] = {}
-    names: set[str] | None = None
-    if mapped_only:
-        names = {*config.dbc.checked, *(one["signal"].partition(".")[0] for one in mapped_signals(config))}
+    mapped = {*config.dbc.checked, *(signal.signal.partition(".")[0] for signal in mapped_signals(config))}
+    names = mapped if mapped_only else None
     for name in config.dbc.input:
         try:
             read = _read_named("dbc.input", config.folder, name, names)
@@ -57,7 +49,7 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
                 faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
     if faults:
         raise ConfigError(faults)
-    if names is not None and not names <= messages.keys():
+    if mapped_only and not mapped <= messages.keys():
         return load_databases(config)  # whoever says what is missing may name what is there
     return _database(message for _, message in messages.values())
 
@@ -65,9 +57,8 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
 def checked_messages(config: Config, database: Database) -> frozenset[str]:
     """Return the names of the messages that must carry a right Counter and Checksum.
 
-    Those are messages with both signals in DBC files that soilbus ships, and what
-    `dbc.checked` names in the database; what another maker's Checksum means is not known.  Raises ConfigError
-    with a line for each name that is in no DBC or cannot be checked.
+    Those are messages with both signals in DBC files that soilbus ships, and what `dbc.checked` names; what another
+    maker's Checksum means is not known.  ConfigError has a line for each name that is in no DBC or cannot be checked.
     """
     found: set[str] = set()
     for path in (located(config.folder, name) for name in config.dbc.input):
@@ -89,7 +80,7 @@ def checked_messages(config: Config, database: Database) -> frozenset[str]:
 def output_database(config: Config) -> Database:
     """Return the messages that soilbus sends, from the address of [j1939] where there is one.
 
-    Raises ConfigError where it is missing, not a DBC, or lacks anything of a message of ours.
+    Raises ConfigError where `output.dbc` is missing, no DBC, or lacks anything of a message of ours.
     """
     name = config.output.dbc
     database = _read_named("output.dbc", config.folder, name)
@@ -151,13 +142,11 @@ def _read(path: Path, names: set[str] | None = None) -> Database:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = raw.decode("cp1252", errors="replace")
-    has_some = False
     check_multiplexers(text)
     if names is not None:
-        has_some = bool(message_names(text))
-        text = of_messages(text, names, lambda identifier: pgn_of(identifier) in STANDARD_PGNS)
+        text = of_messages(text, names)
     database = _parsed(text)
-    if not database.messages and not has_some:
+    if names is None and not database.messages:
         raise ValueError("no message in it")
     return database
 
@@ -168,20 +157,13 @@ def _parsed(text: str) -> Database:
     # not strict: an overlap in a message that nobody maps is none of our business
     database = Database(strict=False)
     database.add_dbc_string(text)
-    for message in database.messages:
-        _check_name("message", message.name)
-        for signal in message.signals:
-            _check_name(f"signal of {message.name}", signal.name)
-    for node in database.nodes:
-        _check_name("node", node.name)
+    named = [("message", message.name) for message in database.messages]
+    named += [(f"signal of {message.name}", signal.name) for message in database.messages for signal in message.signals]
+    for what, name in (*named, *(("node", node.name) for node in database.nodes)):
+        if _IDENTIFIER.fullmatch(name) is None:  # attributes for long names can hold anything
+            said = "letters, digits and _, at most 128 of them, a digit not first"
+            raise ValueError(f"the {what} named {shown(name, LONGEST_NAME)}: a name is {said}")
     return database
-
-
-def _check_name(what: str, name: str) -> None:
-    """Raises ValueError for a name that no DBC may have; attributes for long names can hold anything."""
-    if _IDENTIFIER.fullmatch(name) is None:
-        said = "letters, digits and _, at most 128 of them, a digit not first"
-        raise ValueError(f"the {what} named {shown(name, LONGEST_NAME)}: a name is {said}")
 
 
 def _database(messages: Iterable[Message]) -> Database:

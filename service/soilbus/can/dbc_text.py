@@ -1,14 +1,14 @@
 """A DBC's text without the messages that nobody asks for, checked for ranges that no memory can hold.
 
-cantools makes some 30 kB of each message, and needs 2 ms for it; a manufacturer's DBC may have
-thousands of messages, of which a tractor maps a dozen.  What is not plainly the definition of a
-message, or one line about one, stays: then the parser is the judge of it.
+cantools needs 30 kB and 2 ms for a message; a maker's DBC may have thousands, of which a tractor maps a dozen.  What is
+not plainly the definition of a message, or one line about one, stays: the parser is the judge of it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+
+from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 
 _EXTENDED = 1 << 31
 _MESSAGE = re.compile(
@@ -22,11 +22,9 @@ _ABOUT = re.compile(
     re.MULTILINE,
 )
 
-
 MOST_MULTIPLEXER_VALUES = 1 << 18
 """Values of all ranges of a DBC: 1024 signals in each of 256 pages.  cantools makes 0.3 kB of each."""
-MOST_DIGITS = 12
-"""Digits of a number in a range: a multiplexer of 32 bits has 10."""
+MOST_DIGITS = 12  # digits of a number in a range: a multiplexer of 32 bits has 10
 _RANGES = re.compile(r"\bSG_MUL_VAL_\s+\d+\s+(?P<signal>\w+)\s+\w+(?P<ranges>[^;]*)")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
@@ -44,19 +42,11 @@ def check_multiplexers(text: str) -> None:
                 )
 
 
-def message_names(text: str) -> set[str]:
-    """Return the names of the messages that the text defines."""
-    return {found["name"] for found in _MESSAGE.finditer(text)}
-
-
-def of_messages(text: str, names: set[str], also: Callable[[int], bool]) -> str:
-    """Return the DBC's text with these messages, those that share their identifiers, and `also`.
-
-    `also` is asked with an extended identifier.
-    """
+def of_messages(text: str, names: set[str]) -> str:
+    """Return the DBC's text with these messages, those of their identifiers, and those of the standards' groups."""
     known = [(int(found["id"]), found["name"]) for found in _MESSAGE.finditer(text)]
     wanted = {number for number, name in known if name in names}
-    wanted |= {number for number, _ in known if number & _EXTENDED and also(number & ~_EXTENDED)}
+    wanted |= {number for number, _ in known if number & _EXTENDED and pgn_of(number & ~_EXTENDED) in STANDARD_PGNS}
 
     def kept(found: re.Match[str]) -> str:
         return found[0] if int(found["id"]) in wanted else ""

@@ -7,10 +7,8 @@ from collections import Counter, deque
 from soilbus.can.admission import Counts
 from soilbus.can.channels import Reason
 
-WRONG_CHECKSUMS = 0.05
-"""Share of a message's frames from which wrong checksums are said: where `check --log` warns; a good bus has none."""
-SPAN = 10.0
-"""Time [s] over which a service counts them: a default window."""
+WRONG_CHECKSUMS = 0.05  # share of a message's frames from which wrong checksums are said; a good bus has none
+SPAN = 10.0  # time [s] over which a service counts them: a default window
 
 MEANING = {
     Reason.BAD_CHECKSUM: "wrong Checksum: a second sender or a bad connection; where nearly all are wrong, another"
@@ -20,21 +18,13 @@ MEANING = {
 
 
 def doubts(received: Counter[str], refused: Counter[tuple[str, Reason]]) -> dict[str, str]:
-    """Return a line for each message with a second sender or with many wrong checksums, by message and reason.
-
-    Parameters
-    ----------
-    received
-        Frames by message.
-    refused
-        Refused ones by message and reason.
-    """
+    """Return a line for each message with a second sender or with many wrong checksums, by message and reason."""
     lines = {}
     for (name, reason), n in sorted(refused.items()):
         share = n / max(received[name], n)
         if n and (reason is Reason.SECOND_SENDER or (reason is Reason.BAD_CHECKSUM and share >= WRONG_CHECKSUMS)):
-            text = f"{share:.0%} of {received[name]} frames of {name} are refused: {MEANING[reason]}"
-            lines[f"{name} {reason}"] = text
+            said = f"{share:.0%} of {received[name]} frames of {name} are refused"
+            lines[f"{name} {reason}"] = f"{said}: {MEANING[reason]}"
     return lines
 
 

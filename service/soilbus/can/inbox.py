@@ -1,30 +1,28 @@
 """One message's frames: filed as they come, and checked as whole columns.
 
-A check gives a mask (N,) of the frames that pass, None where all do.
+A check gives a mask (N,) of the frames that pass, None where all do; CHECKS has their order.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from cantools.database.can import Message
 from numpy.typing import NDArray
 
-from soilbus.arrays import Mask
-from soilbus.can.channels import Channel
+from soilbus.arrays import Array, Mask
+from soilbus.can.channels import Channel, Reason
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
 from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
 from soilbus.can.validity import CodeRule, rule_of
 
-TWICE = 0.002
-"""Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
+TWICE = 0.002  # seconds within which a frame that equals the one before it is that frame once more: cycles are longer
 
-COUNTER_ERRORS = 5
-"""Net errors of a counter [frames] from which its message is not trusted (opendbc, `MAX_BAD_COUNTER`)."""
+COUNTER_ERRORS = 5  # net errors of a counter [frames] from which its message is not trusted (opendbc, MAX_BAD_COUNTER)
 
 _NO_FRAME = (-math.inf, -1, b"")
 
@@ -36,7 +34,7 @@ Frame = tuple[float, int, Data]
 class Batch:
     """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length); decoded once, when asked for."""
 
-    t: NDArray[np.float64]
+    t: Array
     ids: NDArray[np.int64]
     payload: NDArray[np.uint8]
     _columns: dict[str, SignalColumn] | None = None
@@ -63,21 +61,16 @@ class Inbox:
     lock: SourceLock | None
     checksum_byte: int | None
     frames: list[Frame] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)
-    """Stamps [s] of frames that came after others which are stamped much later."""
+    late: list[float] = field(default_factory=list)  # stamps [s] of frames that came after much later ones
     last_t: float = -math.inf
     last_id: int = -1
     last_counter: int = -1
     last_data: bytes = b""
-    counter_errors: int = 0
-    """Frames whose counter did not go on by one, less those whose counter did; from 0 to COUNTER_ERRORS."""
-    is_untrusted: bool = False
-    """Whether the errors have reached COUNTER_ERRORS and are not back at 0 yet."""
-    untrusted: Mask | None = None
-    """Which frames of the last batch came while the message was not trusted."""
+    counter_errors: int = 0  # frames whose counter did not go on by one, less those whose did, to COUNTER_ERRORS
+    is_untrusted: bool = False  # whether the errors have reached COUNTER_ERRORS and are not back at 0 yet
+    untrusted: Mask | None = None  # which frames of the last batch came while the message was not trusted
     last_frame: tuple[float, int, bytes] = _NO_FRAME
-    missed: int = 0
-    """Frames that the counters of a checked message skip: lost, or refused for their checksum."""
+    missed: int = 0  # frames that the counters of a checked message skip: lost, or refused for their checksum
 
     def forget(self) -> None:
         """Forget all frames of this message, and its last stamp, counter and sender."""
@@ -98,22 +91,13 @@ def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, check
     decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
     is_standard = message.is_extended_frame and pgn_of(message.frame_id) in STANDARD_PGNS
     rules = tuple(rule_of(message.get_signal_by_name(c.signal), is_standard) for c in channels)
-    return Inbox(
-        message=message,
-        channels=tuple(channels),
-        rules=rules,
-        decoder=decoder,
-        lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
-        checksum_byte=place,
-    )
+    lock = SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None
+    return Inbox(message, tuple(channels), rules, decoder, lock, place)
 
 
 def popped(inbox: Inbox, until: float) -> list[Frame]:
     """Take the frames before `until` out of the inbox and return them."""
-    frames, inbox.frames = inbox.frames, []
-    if until == math.inf:
-        return frames
-    inbox.frames = [f for f in frames if f[0] >= until]
+    frames, inbox.frames = inbox.frames, [f for f in inbox.frames if f[0] >= until and until < math.inf]
     return [f for f in frames if not f[0] >= until] if inbox.frames else frames
 
 
@@ -121,9 +105,8 @@ def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
     """Return False where the payload does not give the Checksum; None where none is asked for."""
     if inbox.checksum_byte is None:
         return None
-    right: Mask = batch.payload[:, inbox.checksum_byte] == column_checksums(
-        batch.ids, batch.payload, inbox.checksum_byte
-    )
+    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
+    right: Mask = batch.payload[:, inbox.checksum_byte] == due
     return right
 
 
@@ -138,10 +121,7 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask:
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """Return False where a frame repeats the counter of its sender's last one; None where no counter is checked.
-
-    What the counters skip is counted in `inbox.missed`; what cannot be trusted is kept for `of_one_sender`.
-    """
+    """Return False where a frame repeats its sender's last counter; keep what cannot be trusted for `of_one_sender`."""
     inbox.untrusted = None
     if inbox.checksum_byte is None:
         return None
@@ -162,8 +142,8 @@ def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
 def _untrusted(inbox: Inbox, batch: Batch, step: NDArray[np.int64], follows: Mask) -> Mask | None:
     """True from the frame whose error is the last of COUNTER_ERRORS until no error is left; None without any error.
 
-    A counter that does not go on by one is an error; one that does takes an error back.  The same counter with another
-    payload is COUNTER_ERRORS at once: only a second sender, or a broken one, sends it.
+    A counter that does not go on by one is an error; one that does takes one back.  The same counter with another
+    payload is COUNTER_ERRORS at once: only a second or a broken sender sends it.
     """
     wrong = follows & (step != 1)
     if not inbox.counter_errors and not wrong.any():
@@ -197,3 +177,13 @@ def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:
     same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)
     once: Mask = ~(close & same & (batch.ids == np.concatenate([[id_before], batch.ids[:-1]])))
     return once
+
+
+CHECKS: Mapping[Reason, Callable[[Inbox, Batch], Mask | None]] = {
+    Reason.BAD_CHECKSUM: checksum_right,
+    Reason.TIME_BACKWARDS: time_forward,
+    Reason.BAD_COUNTER: counter_moved,
+    Reason.SECOND_SENDER: of_one_sender,
+    Reason.DUPLICATE: not_twice,
+}
+"""Why a check refuses a frame, and the check, in their order."""

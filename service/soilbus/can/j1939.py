@@ -27,11 +27,7 @@ _PDU2_MASK = 0x03FFFF00
 
 
 def group_mask(arbitration_id: int) -> int:
-    """Return the bits of a 29-bit identifier that tell its parameter group.
-
-    Below PDU format 240 (PDU1) the second byte is a destination address and no part of the
-    group; from 240 (PDU2) it is.
-    """
+    """Return the bits of a 29-bit identifier that tell its parameter group: below PDU format 240 without byte 2."""
     return _PDU1_MASK if (arbitration_id >> 16) & 0xFF < _PDU2 else _PDU2_MASK
 
 
@@ -54,10 +50,9 @@ def name_of(unit: J1939) -> int:
 
 @dataclass(slots=True)
 class SourceLock:
-    """Lock on one source address of a parameter group.
+    """Lock on the first source heard of a parameter group, until it is silent for `patience` [s].
 
-    The first source heard counts until it is silent for `patience` [s]; `own`, the address that
-    the DBC names, takes over whenever it talks.
+    `own`, the address that the DBC names, takes over whenever it talks.
     """
 
     own: int

@@ -1,13 +1,14 @@
 """The formats of logs that people have, each recognised by its content and read as frames with their channels.
 
-    first bytes -> Format(name, frames)         frames(stream) -> batches of (channels, frames)
+    first bytes -> Format(name, frames)         frames(stream) -> (channel, frame) of each
 
-python-can reads ASC, BLF, TRC and MF4; candump (can/candump.py), CSV and BUSMASTER are read here.
+python-can reads ASC, BLF, TRC, MF4 and its own CSV; candump (can/candump.py), other CSVs and BUSMASTER are read here.
 """
 
 from __future__ import annotations
 
 import gc
+import math
 import mmap
 import re
 import sqlite3
@@ -15,11 +16,11 @@ import struct
 import sys
 import traceback
 import zlib
-from base64 import b64decode
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
-from datetime import UTC, datetime, timedelta
-from io import BufferedReader, RawIOBase
+from datetime import UTC, datetime
+from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from shutil import copyfileobj
 from tempfile import NamedTemporaryFile
@@ -27,24 +28,23 @@ from typing import NamedTuple
 
 import can
 
-from soilbus.can.candump import Batch, candump_batches, is_candump, of_message
-from soilbus.can.mcap_frames import frame_batches
+from soilbus.can.candump import Heard, candump_frames, is_candump, of_message
+from soilbus.can.mcap_frames import mcap_frames
 from soilbus.files import LIMITS, text_lines, within_ratio
 
-HEAD = 1 << 13
-"""Bytes at the begin of a log by which its format is recognised."""
-WRAP = 1 << 32
-"""Microseconds after which the stamps of an analyser of 32 bits begin again."""
+HEAD = 1 << 13  # bytes at the begin of a log by which its format is recognised
+WRAP = 2**32 / 1e6  # seconds after which the stamps of an analyser of 32 bits begin again
 OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
-DAY = 86400.0
-"""Seconds after which a clock of hours, minutes and seconds begins again."""
+TOO_LARGE = f"a block of more than {LIMITS.block >> 20} MiB"
+DAY = 86400.0  # seconds after which a clock of hours, minutes and seconds begins again
+RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
 class Format(NamedTuple):
     """Name of a format for a user, and the reader of a stream of it, which raises all kinds on a damaged file."""
 
     name: str
-    batches: Callable[[BufferedReader], Iterator[Batch]]
+    frames: Callable[[BufferedReader], Iterator[Heard]]
 
 
 def format_of(head: bytes) -> Format:
@@ -64,15 +64,15 @@ def format_of(head: bytes) -> Format:
         raise ValueError("binary data of no known format")
     first = lines[0]
     if first.startswith("***BUSMASTER"):
-        return Format("BUSMASTER log", lambda stream: busmaster(text_lines(stream)))
+        return Format("BUSMASTER log", _busmaster)
     if csv := csv_of_frames(first):
-        return Format(csv.name, lambda stream: _of_csv(csv, text_lines(stream)))
+        return csv
     if first.startswith(";") or _TRC_LINE.match(first):
         return Format("PCAN TRC log", lambda stream: map(of_message, can.TRCReader(text_lines(stream))))  # type: ignore[arg-type]
     if any(map(_ASC_LINE.match, lines)):
-        return Format("Vector ASC log", lambda stream: asc(text_lines(stream)))
+        return Format("Vector ASC log", _asc)
     if any(map(is_candump, lines)):
-        return Format("candump log", lambda stream: candump_batches(text_lines(stream)))
+        return Format("candump log", lambda stream: candump_frames(text_lines(stream)))
     if "\ufffd" in text:
         raise ValueError("binary data of no known format")
     if columns := [cell for cell in re.split("[,;\t]", first) if cell.strip()][1:]:
@@ -92,16 +92,11 @@ _TRC_LINE = re.compile(r"\d+\)\s+\d")
 _ASC_NO_FRAME = re.compile(r"\s*+(date\s|[\d.]++\s++(CANFD\s++(?!\d)|.*\sTxRq\s))", re.IGNORECASE)
 """Events that python-can would take for frames ("Start of measurement" of CAN FD, requests to send), and the date:
 in some languages python-can does not know it and reads no base after it."""
-RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
-def asc(lines: Iterable[str]) -> Iterator[Batch]:
-    """Yield the frames of a Vector ASC log.
-
-    Its stamps count from its begin.  Events between frames do not come from the reader, so stamps that only say how
-    long after the last event each came cannot be summed up: ValueError.
-    """
-    reader = can.ASCReader(line for line in lines if not _ASC_NO_FRAME.match(line))  # type: ignore[arg-type]
+def _asc(stream: BufferedReader) -> Iterator[Heard]:
+    """Stamps count from the log's begin; those after the last event cannot be summed up, as not all events are read."""
+    reader = can.ASCReader(line for line in text_lines(stream) if not _ASC_NO_FRAME.match(line))  # type: ignore[arg-type]
     last = float("-inf")
     for message in reader:
         if message.timestamp < last and reader.timestamps_format == "relative":
@@ -110,91 +105,87 @@ def asc(lines: Iterable[str]) -> Iterator[Batch]:
         yield of_message(message, 1)
 
 
-class _Csv(NamedTuple):
-    """Name of a CSV of frames, the columns by which it is recognised, and the frame of a row of all its columns."""
+class _Clock:
+    """Time [s] that goes on where the stamps begin again after a period [s]."""
 
-    name: str
-    columns: frozenset[str]
-    frame: Callable[[Mapping[str, str]], tuple[float, int, bool, bytes, int, bool, bool]]
-    """Time [s], identifier, whether extended, data, length, whether remote, whether an error."""
-    wraps: bool = False
-    """Whether the stamps begin again after 32 bits of microseconds."""
+    def __init__(self, period: float) -> None:
+        self._period, self._late, self._last = period, 0.0, -math.inf
+
+    def __call__(self, t: float) -> float:
+        if self._period > self._last > t + self._period / 2.0:
+            self._late += self._period
+        self._last = t
+        return t + self._late
 
 
 def _truth(text: str) -> bool:
     return text.lower() in ("1", "true")
 
 
-_ROWS = (
-    _Csv(
-        "SavvyCAN (GVRET) CSV", frozenset({"time stamp", "id", "extended", "len", "d1"}),
-        lambda row: (
-            int(row["time stamp"]) / 1e6, int(row["id"], 16), _truth(row["extended"]),
-            bytes(int(cell, 16) for i in range(1, 65) if (cell := row.get(f"d{i}", ""))), int(row["len"]), False, False,
-        ),
-        wraps=True,
-    ),
-    _Csv(
-        "CANedge CSV", frozenset({"timestampepoch", "id", "ide", "databytes"}),
-        lambda row: (
-            float(row["timestampepoch"]), int(row["id"], 16), _truth(row["ide"]), bytes.fromhex(row["databytes"]),
-            int(row.get("datalength", len(row["databytes"]) // 2)), _truth(row.get("rtr", "0")), False,
-        ),
-    ),
-    _Csv(
-        "CSV of python-can", frozenset({"timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"}),
-        lambda row: (
-            float(row["timestamp"]), int(row["arbitration_id"], 16), _truth(row["extended"]),
-            b64decode(row["data"], validate=True), int(row["dlc"]), _truth(row["remote"]), _truth(row["error"]),
-        ),
-    ),
-)  # fmt: skip
+def _gvret(row: Mapping[str, str]) -> tuple[float, bool, bytes, int, bool]:
+    data = bytes(int(cell, 16) for i in range(1, 65) if (cell := row.get(f"d{i}", "")))
+    return int(row["time stamp"]) / 1e6, _truth(row["extended"]), data, int(row["len"]), False
 
 
-def _names(header: str) -> list[str]:
-    return [cell.strip().lower() for cell in header.replace(";", ",").split(",")]
+def _canedge(row: Mapping[str, str]) -> tuple[float, bool, bytes, int, bool]:
+    data = bytes.fromhex(row["databytes"])
+    length = int(row.get("datalength", len(data)))
+    return float(row["timestampepoch"]), _truth(row["ide"]), data, length, _truth(row.get("rtr", "0"))
 
 
-def csv_of_frames(header: str) -> _Csv | None:
-    """Return the kind of CSV of frames with this first line; None of any other."""
-    return next((csv for csv in _ROWS if csv.columns <= set(_names(header))), None)
+_CSVS = (
+    ("SavvyCAN (GVRET) CSV", {"time stamp", "id", "extended", "len", "d1"}, _gvret),
+    ("CANedge CSV", {"timestampepoch", "id", "ide", "databytes"}, _canedge),
+)
+"""Name, columns by which it is recognised, and what a row says: time [s], extended, data, length, remote."""
+_OF_PYTHON_CAN = ["timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"]
 
 
-def _of_csv(csv: _Csv, lines: Iterable[str]) -> Iterator[Batch]:
-    rows = iter(lines)
-    names = _names(next(line for line in rows if line.strip()))
-    late, last = 0.0, float("-inf")
+def csv_of_frames(header: str) -> Format | None:
+    """Return the format of a CSV of frames with this first line; None of any other."""
+    names = _cells(header.lower())
+    if names == _OF_PYTHON_CAN:
+        return Format("CSV of python-can", lambda stream: map(of_message, can.CSVReader(text_lines(stream))))  # type: ignore[arg-type]
+    for name, columns, said in _CSVS:
+        if columns <= {*names}:
+            return Format(name, partial(_of_csv, said))
+    return None
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.replace(";", ",").split(",")]
+
+
+def _of_csv(
+    said: Callable[[Mapping[str, str]], tuple[float, bool, bytes, int, bool]], stream: BufferedReader
+) -> Iterator[Heard]:
+    rows = (line for line in text_lines(stream) if line.strip())
+    names = _cells(next(rows).lower())
+    unwrapped = _Clock(WRAP if said is _gvret else math.inf)
     for line in rows:
-        if not line.strip():
-            continue
-        cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
+        cells = _cells(line)
         if len(cells) > len(names):
             cells = [*cells[: len(names)], *filter(None, cells[len(names) :])]  # a comma at the end of a line
         row = dict(zip(names, cells, strict=len(cells) > len(names)))
         try:
-            t, identifier, extended, data, length, remote, error = csv.frame(row)
+            identifier = int(row["id"], 16)
+            t, extended, data, length, remote = said(row)
         except KeyError as name:
             raise ValueError(f"a line without {name}") from None
-        if csv.wraps and last - t > WRAP / 2e6 and last < WRAP / 1e6:
-            late += WRAP / 1e6
-        last = t
-        if not remote and not error and len(data) != length:
+        if not remote and len(data) != length:
             raise ValueError(f"a frame of {length} bytes has {len(data)}")
         channel = row.get("bus") or row.get("buschannel") or ""
-        yield (channel,), [(t + late, identifier & 0x1FFFFFFF, extended, data, remote, error)]
+        yield channel, (unwrapped(t), identifier & 0x1FFFFFFF, extended, data, remote, False)
 
 
 _BUSMASTER_DATE = re.compile(r"\*\*\*START DATE AND TIME (\d+):(\d+):(\d+) ")
 
 
-def busmaster(lines: Iterable[str]) -> Iterator[Batch]:
-    """Yield the frames of a log of BUSMASTER; stamps are the time of the day, or count from its begin.
-
-    Raises ValueError where they only say how long after the frame before each came.
-    """
-    base, midnight, turn, last = 16, 0.0, 0.0, 0.0
+def _busmaster(stream: BufferedReader) -> Iterator[Heard]:
+    """Stamps are the time of the day, or count from the log's begin."""
+    base, midnight, unwrapped = 16, 0.0, _Clock(DAY)
     in_day = True
-    for line in lines:
+    for line in text_lines(stream):
         if line.startswith("***"):
             if line.startswith("***DEC"):
                 base = 10
@@ -204,80 +195,69 @@ def busmaster(lines: Iterable[str]) -> Iterator[Batch]:
                 in_day = False
             elif found := _BUSMASTER_DATE.match(line):
                 day, month, year = map(int, found.groups())
-                midnight, turn, last = datetime(year, month, day, tzinfo=UTC).timestamp(), 0.0, 0.0
+                midnight, unwrapped = datetime(year, month, day, tzinfo=UTC).timestamp(), _Clock(DAY)
+        if line.startswith("***") or not line.strip():
             continue
-        words = line.split()
-        if not words:
-            continue
-        stamp, _, channel, identifier, kind, length, *data = words
-        hours, minutes, seconds, parts = stamp.split(":")  # the last in units of 0.1 ms
-        t = timedelta(hours=int(hours), minutes=int(minutes), seconds=int(seconds)).total_seconds() + int(parts) / 1e4
-        if last - t > DAY / 2.0:
-            turn += DAY
-        last = t
+        stamp, _, channel, identifier, kind, length, *data = line.split()
+        hours, minutes, seconds, parts = map(int, stamp.split(":"))  # the last in units of 0.1 ms
+        t = unwrapped(3600.0 * hours + 60.0 * minutes + seconds + parts / 1e4)
         remote, n = "r" in kind.lower(), int(length)
         content = b"" if remote else bytes(int(byte, base) for byte in data[:n])
         if not remote and len(content) != n:
             raise ValueError(f"a frame of {n} bytes has {len(content)}")
         number = int(identifier, 16 if identifier.lower().startswith("0x") else base)
-        frame = (t + turn + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
-        yield (channel,), [frame]
+        yield channel, (t + midnight * in_day, number, kind.lower().startswith("x"), content, remote, False)
 
 
 # --- binary
 
 
-class _PlainBlf(RawIOBase):
-    """A BLF file with the containers unpacked, each bounded, for python-can's reader, which would unpack any size."""
+_BLF_OBJECT, _BLF_CONTAINER = struct.Struct("<4s4xLL"), struct.Struct("<H6xL4x")
+_IS_CONTAINER, _IS_PLAIN, _IS_DEFLATED, _LEAST_BLF_HEAD = 10, 0, 2, 144
 
-    _BASE, _CONTAINER = struct.Struct("<4sHHLL"), struct.Struct("<H6xL4x")
-    _IS_CONTAINER, _IS_DEFLATED = 10, 2
 
-    def __init__(self, stream: BufferedReader) -> None:
-        self._stream = stream
-        self._packed = self._plain = 0
-        head = stream.read(8)
-        self._left = head + self._exactly(max(struct.unpack("<4xL", head)[0] - 8, 0))
+class _BoundedBlf(can.BLFReader):
+    """python-can's reader, which would unpack a container of any size, with each of them bounded."""
 
-    def read(self, size: int = -1) -> bytes:
-        """The next bytes; nothing more at the end."""
-        while len(self._left) < size and (more := self._next()):
-            self._left += more
-        found, self._left = self._left[:size], self._left[size:]
-        return found
-
-    def _exactly(self, size: int) -> bytes:
-        if size > LIMITS.block:
-            raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
-        content = self._stream.read(size)
-        if len(content) < size:
-            raise ValueError("cut off within a block")
-        return content
-
-    def _next(self) -> bytes:
-        head = self._stream.read(self._BASE.size)
-        if not head.strip(b"\0"):  # the end, which may be padded
-            return b""
-        mark, length, version, size, kind = self._BASE.unpack(head)
-        body = self._exactly(max(size - len(head), 0))
-        padding = self._stream.read(size % 4)
-        if mark != b"LOBJ" or kind != self._IS_CONTAINER:
-            return head + body + padding
-        method, _ = self._CONTAINER.unpack_from(body)
-        content = body[self._CONTAINER.size :]
-        if method == self._IS_DEFLATED:
-            decoder = zlib.decompressobj()
-            content = decoder.decompress(content, LIMITS.block)
-            if decoder.unconsumed_tail:
-                raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
-            if not decoder.eof:
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        packed = plain = 0
+        while (head := self.file.read(_BLF_OBJECT.size)).strip(b"\0"):  # the end may be padded
+            mark, size, kind = _BLF_OBJECT.unpack(head)
+            left = max(size - len(head), 0)
+            body = self.file.read(min(left, LIMITS.block + 1))
+            if mark != b"LOBJ" or len(body) > LIMITS.block:
+                raise ValueError(TOO_LARGE if mark == b"LOBJ" else "no object of a BLF log")
+            if len(body) < left:
                 raise ValueError("cut off within a block")
-            method = 0
-        self._packed, self._plain = self._packed + len(body), self._plain + len(content)
-        within_ratio(self._packed, self._plain)
-        size = self._BASE.size + self._CONTAINER.size + len(content)
-        head = self._BASE.pack(mark, length, version, size, kind)
-        return head + self._CONTAINER.pack(method, len(content)) + content + bytes(size % 4)
+            self.file.read(size % 4)
+            if kind != _IS_CONTAINER:
+                continue
+            method, _ = _BLF_CONTAINER.unpack_from(body)
+            content = body[_BLF_CONTAINER.size :]
+            if method == _IS_DEFLATED:
+                content = inflated(content)
+            packed, plain = packed + len(body), plain + len(content)
+            within_ratio(packed, plain)
+            if method in (_IS_PLAIN, _IS_DEFLATED):
+                yield from self._parse_container(content)
+
+
+def _blf(stream: BufferedReader) -> Iterator[Heard]:
+    (size,) = struct.unpack_from("<4xL", stream.peek(8))
+    if not _LEAST_BLF_HEAD <= size <= LIMITS.block:
+        raise ValueError("no head of a BLF log")
+    return (of_message(message, 1) for message in _BoundedBlf(stream))
+
+
+def inflated(packed: bytes) -> bytes:
+    """Return what deflated bytes unpack to; ValueError where it is more than LIMITS.block, or cut off."""
+    decoder = zlib.decompressobj()
+    content = decoder.decompress(packed, LIMITS.block)
+    if decoder.unconsumed_tail:
+        raise ValueError(TOO_LARGE)
+    if not decoder.eof:
+        raise ValueError("cut off within a block")
+    return content
 
 
 @contextmanager
@@ -292,7 +272,7 @@ def placed_copy(stream: BufferedReader) -> Iterator[Path]:
 _MF4_BLOCK = re.compile(rb"##DZ....(.{8})\0{8}(..)([\0-\xff]).(.{4})(.{8})(.{8})", re.DOTALL)
 
 
-def _mf4(stream: BufferedReader) -> Iterator[Batch]:
+def _mf4(stream: BufferedReader) -> Iterator[Heard]:
     if can.io.mf4.asammdf is None:  # type: ignore[attr-defined]
         raise ModuleNotFoundError("this format needs soilbus[mf4]")
     with placed_copy(stream) as path:
@@ -329,18 +309,14 @@ def check_mf4_blocks(path: Path) -> None:
                 continue  # no block, but data that look like one
             if found[3] not in b"\0\1":
                 raise ValueError("a block that is packed by other than deflate")
-            decoder, place = zlib.decompressobj(), found.end()
-            block = len(decoder.decompress(content[place : place + int.from_bytes(found[6], "little")], LIMITS.block))
-            if decoder.unconsumed_tail:
-                raise ValueError(f"a block of more than {LIMITS.block >> 20} MiB")
-            plain += block
+            plain += len(inflated(content[found.end() : found.end() + int.from_bytes(found[6], "little")]))
             within_ratio(size, plain)
 
 
 _SQL = "SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages"
 
 
-def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
+def _sqlite(stream: BufferedReader) -> Iterator[Heard]:
     """Frames of python-can's SQLite log; a view, a function or a virtual table in their place is refused."""
     with placed_copy(stream) as path, closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as log:
         log.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LIMITS.line)
@@ -363,9 +339,9 @@ def _sqlite(stream: BufferedReader) -> Iterator[Batch]:
 
 
 _BINARY = {
-    b"LOGG": Format("BLF log", lambda file: (of_message(m, 1) for m in can.BLFReader(_PlainBlf(file)))),  # type: ignore[arg-type]
+    b"LOGG": Format("BLF log", _blf),
     b"MDF     4": Format("MF4 log", _mf4),
-    b"\x89MCAP": Format("MCAP log", frame_batches),
+    b"\x89MCAP": Format("MCAP log", mcap_frames),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
 }
 _NO_FRAMES = {

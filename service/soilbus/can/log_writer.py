@@ -32,15 +32,7 @@ def format_of(path: Path) -> tuple[str, bool]:
 
 
 def write_log(messages: Iterable[can.Message], path: Path) -> None:
-    """Write a log in the format of the file's suffix (.log, .asc, .csv, .blf, .log.gz), whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        The suffix is unknown.
-    OSError
-        The file cannot be written.
-    """
+    """Write a log in the format of the file's suffix, whole or not at all; ValueError as `format_of`, else OSError."""
     kind, is_packed = format_of(path)
     with placed(path) as descriptor, open(descriptor, "wb+", closefd=False) as raw:
         packed = gzip.GzipFile(fileobj=raw, mode="wb") if is_packed else raw

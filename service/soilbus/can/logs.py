@@ -1,6 +1,6 @@
 """A log of any format as the frames of one channel, within its limits; its faults in one line.
 
-file -> plain bytes (files.opened) -> batches of its format (log_formats) -> frames of one channel
+file -> plain bytes (files.opened) -> frames of its format (log_formats) -> frames of one channel
 """
 
 from __future__ import annotations
@@ -8,35 +8,27 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from io import BufferedReader
-from itertools import pairwise
+from collections.abc import Collection, Iterator
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from statistics import median
 
-from soilbus.can.candump import Batch, Frame
-from soilbus.can.log_formats import HEAD, Format, format_of
+from soilbus.can.candump import Frame, Heard
+from soilbus.can.log_formats import HEAD, format_of
 from soilbus.files import opened, packing, within_ratio
 from soilbus.words import WorkError, one_line, shown
 
-CHANNEL_SCAN_FRAMES = 2000
-"""Frames of a log in which its channels are looked for: several seconds of a bus."""
-LEAST_FRAME = 16
-"""Bytes of a frame in memory at least: what the packed bytes of a log are compared with."""
-MOST_BACKWARDS = 0.1
-"""Share of frames that may be stamped before the one before: two channels merged have some, relative stamps half."""
-LEAST_STAMPS = 20
-"""Frames from which stamps are judged."""
+CHANNEL_SCAN_FRAMES = 2000  # frames of a log in which its channels are looked for: several seconds of a bus
+LEAST_FRAME = 16  # bytes of a frame in memory at least: what the packed bytes of a log are compared with
+MOST_BACKWARDS = 0.1  # share of stamps that may go back: two channels merged have some, relative stamps half
+LEAST_STAMPS = 20  # frames from which stamps are judged
 
 
 class LogError(WorkError):
-    """Error of a log that cannot be read to its end; `windows` ended before the damage.
+    """Error of a log that cannot be read to its end."""
 
-    `lasting` is False where the fault is of the machine that reads it, not of what is in the log.
-    """
-
-    windows = 0
-    lasting = True
+    windows = 0  # that ended before the damage
+    lasting = True  # False where the fault is of the machine that reads it, not of what is in the log
 
     def __init__(self, text: str) -> None:
         super().__init__(shown(text))
@@ -47,35 +39,19 @@ class OtherBus(LogError):
 
 
 class Log:
-    """A log that can be read once.
+    """A log that can be read once; "-" is standard input.
 
-    Parameters
-    ----------
-    path
-        Of the file; "-" is standard input.
-    channel
-        Whose frames are wanted, as the log names it (can0, 1); canN is also the channel numbered N + 1, or N in a log
-        whose numbers begin at 0.  Empty for all.
-    demanded
-        Whether a log of one other channel alone is refused; else that channel is taken.
-
-    Attributes
-    ----------
-    kind
-        Its format, such as "candump log, gzip"; empty before the first frame.
-    channels
-        Frames by channel, as far as it was read.
-    chosen
-        The channel whose frames are handed out.
-    span
-        Time from the first frame to the latest one read [s].
+    `channel` is whose frames are wanted, as the log names it (can0, 1); canN is also the channel numbered N + 1, or N
+    in a log whose numbers begin at 0.  Empty for all.  A log of one other channel alone is read, unless `demanded`.
     """
 
     def __init__(self, path: Path, channel: str = "", demanded: bool = False) -> None:
         self.path, self.wanted, self._demanded = path, channel, demanded
-        self.kind, self.chosen, self.span, self._given = "", "", 0.0, 0
-        self.channels: Counter[str] = Counter()
-        self._is_awaited = False
+        self.kind = ""  # its format, such as "candump log, gzip", from the first frame on
+        self.chosen = ""  # the channel whose frames are handed out
+        self.channels: Counter[str] = Counter()  # frames by channel, as far as it was read
+        self.span = 0.0  # time from the first frame to the latest one read [s]
+        self._given = 0
 
     @property
     def name(self) -> str:
@@ -104,112 +80,86 @@ class Log:
         return ""
 
     def frames(self) -> Iterator[Frame]:
-        """Yield its frames.
-
-        Raises
-        ------
-        LogError
-            The file is missing, no log of frames, damaged, made to fill the memory, or has not the channel wanted.
-        """
+        """Yield its frames; LogError where it is no whole log of frames, or has not the channel."""
         try:
             yield from self._frames()
-        except LogError:
-            raise
-        except FileNotFoundError:
-            raise LogError(f"{self.name}: no such file") from None
-        except ModuleNotFoundError as error:
-            raise self._of_machine(str(error)) from None
-        except MemoryError:
-            raise self._of_machine("not enough memory to read it") from None
-        except OSError as error:
-            if self.channels or error.errno is None:
-                raise LogError(self._damage(error)) from None
-            raise self._of_machine(error.strerror or str(error)) from None
         except Exception as error:  # readers raise all kinds on a damaged file
-            raise LogError(self._damage(error)) from None
+            raise self._fault(error) from None
         if not self.channels:
             raise LogError(f"{self.name}: no frame in it")
 
-    def _of_machine(self, what: str) -> LogError:
-        fault = LogError(f"{self.name}: {what}")
-        fault.lasting = False
-        return fault
-
-    def _damage(self, error: Exception) -> str:
+    def _fault(self, error: Exception) -> LogError:
+        if isinstance(error, LogError):
+            return error
+        if isinstance(error, FileNotFoundError):
+            return LogError(f"{self.name}: no such file")
+        is_of_file_system = isinstance(error, OSError) and error.errno is not None and not self.channels
+        if is_of_file_system or isinstance(error, (MemoryError, ModuleNotFoundError)):
+            is_full = isinstance(error, MemoryError)
+            why = "not enough memory to read it" if is_full else getattr(error, "strerror", None) or str(error)
+            fault = LogError(f"{self.name}: {why}")
+            fault.lasting = False
+            return fault
         what = f"cut off or damaged after {self._given} frames" if self._given else "not a CAN log that can be read"
         why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 150)
-        return f"{self.name}: {what} ({why})"
+        return LogError(f"{self.name}: {what} ({why})")
 
     def _frames(self) -> Iterator[Frame]:
         with opened(self.path) as stream:
             found = format_of(stream.peek(HEAD))
             self.kind = ", ".join(filter(None, (found.name, packing(stream))))
-            batches = self._counted(found, stream)
-            head: list[Batch] = []
+            heard = self._counted(found.frames(stream))
+            head: list[Heard] = []
             fault: Exception | None = None
             try:
-                for batch in batches:
-                    head.append(batch)
-                    if self.channels.total() >= CHANNEL_SCAN_FRAMES:
-                        break
+                head.extend(islice(heard, CHANNEL_SCAN_FRAMES))
             except Exception as error:  # after the frames before it
                 fault = error
-            _check_stamps([frame[0] for _, frames in head for frame in frames])
+            _check_stamps([frame[0] for _, frame in head])
             self._choose()
-            for batch in head:
-                yield from self._of_channel(batch)
+            for self._given, (channel, frame) in enumerate(chain(head, heard), 1):
+                if self.wanted and channel != self.chosen:
+                    self.chosen = self.chosen or _meant(self.wanted, self.channels) or ""  # it may begin late
+                    if channel != self.chosen and (channel or not frame[5]):
+                        continue
+                yield frame
             if fault is not None:
                 raise fault
-            for batch in batches:
-                yield from self._of_channel(batch)
-        if self._is_awaited:
+        if self.wanted and self.channels and self.chosen not in self.channels:
             raise self._not_in_it()
         if self.wanted and self.chosen != (meant := _meant(self.wanted, self.channels)) and meant is not None:
             raise LogError(
                 f"{self.name}: begins with {self.chosen} alone, but has {meant} too: read it with --channel {meant}"
             )
 
-    def _counted(self, found: Format, stream: BufferedReader) -> Iterator[Batch]:
+    def _counted(self, heard: Iterator[Heard]) -> Iterator[Heard]:
         size = self.path.stat().st_size if self.path.is_file() else math.inf
-        first = math.nan
-        for channels, frames in found.batches(stream):
-            if frames:
-                first = frames[0][0] if math.isnan(first) else first
-                self.span = max(self.span, max(frame[0] for frame in frames) - first)
-            named: Iterable[str] = channels
-            if "" in channels:  # error frames of candump, whose reader keeps no channel
-                named = (channel for channel, frame in zip(channels, frames, strict=True) if channel or not frame[5])
-            self.channels.update(named)
-            within_ratio(size, LEAST_FRAME * self.channels.total())
-            yield channels, frames
+        first = 0.0
+        for n, (channel, frame) in enumerate(heard, 1):
+            if n == 1:
+                first = frame[0]
+            if frame[0] - first > self.span:
+                self.span = frame[0] - first
+            if channel or not frame[5]:  # candump's reader keeps no channel of error frames
+                self.channels[channel] += 1
+            if n % CHANNEL_SCAN_FRAMES == 0:
+                within_ratio(size, LEAST_FRAME * n)
+            yield channel, frame
 
     def _choose(self) -> None:
-        """Choose the channel by the frames read so far."""
+        """Choose the channel by the frames read so far; leave it empty where a demanded one may begin later."""
         if not self.wanted or not self.channels:
             return
         chosen = _meant(self.wanted, self.channels)
         if chosen is None and len(self.channels) == 1 and not (self._demanded and min(self.channels)):
             chosen = min(self.channels)
-        if chosen is None and self._demanded:  # it may begin later
-            self._is_awaited = True
-            return
-        if chosen is None:
+        if chosen is None and not self._demanded:
             raise self._not_in_it()
-        self.chosen = chosen
+        self.chosen = chosen or ""
 
     def _not_in_it(self) -> LogError:
         there = _listed(sorted(self.channels))
         return LogError(f"{self.name}: no frame of {self.wanted}, but of {there}: choose with --channel")
-
-    def _of_channel(self, batch: Batch) -> list[Frame]:
-        channels, frames = batch
-        if self._is_awaited and (meant := _meant(self.wanted, self.channels)) is not None:
-            self.chosen, self._is_awaited = meant, False
-        self._given += len(frames)
-        if not self.wanted or set(channels) <= {self.chosen}:
-            return frames
-        pairs = zip(channels, frames, strict=True)
-        return [frame for channel, frame in pairs if channel == self.chosen or (frame[5] and not channel)]
 
 
 def read_frames(path: Path, channel: str = "") -> Iterator[Frame]:

@@ -23,42 +23,20 @@ SHARED_ROLES = ("torque", "speed", "load")
 """Roles of which one signal may be mapped for several wheels: it is one measurement, with one noise."""
 POSITION_ROLES = ("latitude", "longitude")
 LOCK = "differential_lock"
-VEHICLE_ROLES = (
-    "ground_speed",
-    "draft",
-    "pitch",
-    "acceleration",
-    "yaw_rate",
-    "roll",
-    "steering_angle",
-    *POSITION_ROLES,
-)
-OPTIONAL_ROLES = ("yaw_rate", "roll", "steering_angle", LOCK, *POSITION_ROLES)
-"""Without them a window is as good as before."""
+OF_MOTION = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "roll", "steering_angle")
+VEHICLE_ROLES = (*OF_MOTION, *POSITION_ROLES)
+OPTIONAL_ROLES = ("yaw_rate", "roll", "steering_angle", LOCK, *POSITION_ROLES)  # a window is as good without
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
-LEAST_GAP, GAP_CYCLES = 2.0, 1.5
-"""A position is stale after these seconds, or, where the DBC says that it is sent seldom, after these cycles."""
+LEAST_GAP, GAP_CYCLES = 2.0, 1.5  # seconds, and cycles of what is sent seldom, after which a position is stale
 _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 
 DIMENSIONS: Mapping[str, tuple[str, ...]] = {
-    "torque": ("torque",),
-    "torque_limit": ("torque",),
-    "motor_speed": ("rotation",),
-    "speed": ("rotation", "speed"),
-    "load": ("force", "mass"),
-    "sinkage": ("length",),
-    "ground_speed": ("speed",),
-    "draft": ("force",),
-    "pitch": ("angle",),
-    "acceleration": ("acceleration",),
-    "yaw_rate": ("rotation",),
-    "roll": ("angle",),
-    "steering_angle": ("angle",),
-    LOCK: ("",),
-    "latitude": ("angle",),
-    "longitude": ("angle",),
-}
+    "torque": ("torque",), "torque_limit": ("torque",), "motor_speed": ("rotation",), "speed": ("rotation", "speed"),
+    "load": ("force", "mass"), "sinkage": ("length",), "ground_speed": ("speed",), "draft": ("force",),
+    "pitch": ("angle",), "acceleration": ("acceleration",), "yaw_rate": ("rotation",), "roll": ("angle",),
+    "steering_angle": ("angle",), LOCK: ("",), "latitude": ("angle",), "longitude": ("angle",),
+}  # fmt: skip
 """Dimensions that the unit of a role's signal may have, that of its values in SI first."""
 _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
 _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
@@ -67,27 +45,18 @@ _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
 class _Number(NamedTuple):
     """What a number of the mapping makes of a signal in a unit that is not one of the role."""
 
-    roles: tuple[str, ...]
+    what: str
     units: Mapping[str, float]
-    bare: str
-    """The unit of a signal without one."""
     dimension: str
-    wanted: str
-    hint: str
+    unit: str
 
 
-_TORQUES = ("torque", "torque_limit")
+_PRESSURES = {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757}
 _NUMBERS: Mapping[str, _Number] = {
-    "torque_constant": _Number(
-        _TORQUES, {"A": 1.0, "mA": 1e-3, "kA": 1e3}, "A", "torque",
-        "a current in A or mA", "a current: give its torque_constant [N m/A]",
-    ),
-    "reference_torque": _Number(_TORQUES, {"%": 0.01}, "no unit", "torque", "%", ""),
-    "effective_area": _Number(
-        ("load",), {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "MPa": 1e6, "psi": 6894.757},
-        "Pa", "force", "a pressure in Pa, kPa or bar", "a pressure: give effective_area [m^2]",
-    ),
-}  # fmt: skip
+    "torque_constant": _Number("current", {"": 1.0, "A": 1.0, "mA": 1e-3, "kA": 1e3}, "torque", "N m/A"),
+    "reference_torque": _Number("percentage", {"%": 0.01}, "torque", "N m"),
+    "effective_area": _Number("pressure", {"": 1.0, **_PRESSURES}, "force", "m^2"),
+}
 """By key of the mapping."""
 
 
@@ -99,30 +68,27 @@ class _Role(NamedTuple):
     quantity: str
     part: Wheel | Axle | None
     mapped: Mapped
-    where: str
-    """The key in the configuration file."""
+    where: str  # the key in the configuration file
 
 
 def channels_of(config: Config, database: Database) -> list[Channel]:
     """Return one channel for each role that the configuration maps, wheels first.
 
-    Raises ConfigError with a line for each fault: a message or signal that the DBC does not
-    have (the nearest name is suggested), a unit of another dimension than the role, a signal
-    mapped twice, a signal that cannot be decoded, a validity signal that cannot work.
+    Raises ConfigError with a line for each fault: a signal that is not in the DBC, cannot be decoded, has a unit of
+    another dimension than the role or is mapped twice; a validity signal that cannot work.
     """
-    faults: list[str] = []
-    channels: list[Channel] = []
-    seen: set[tuple[str, str]] = set()
-    for role in _roles(config):
-        key = (role.quantity, role.mapped.signal)
-        if role.quantity in SHARED_ROLES and isinstance(role.part, Wheel) and key in seen:
+    roles = list(_roles(config))
+    first = {(role.quantity, role.mapped.signal): role for role in reversed(roles)}
+    channels, faults = [], []
+    for role in roles:
+        is_shared = role.quantity in SHARED_ROLES and isinstance(role.part, Wheel)
+        if is_shared and first[role.quantity, role.mapped.signal] is not role:
             continue  # the channel of another wheel, too, which came first
-        seen.add(key)
         try:
             channels.append(_channel(config, database, role))
         except _Fault as fault:
             faults.append(f"{role.where}: {fault}")
-    faults += _mapped_twice(_roles(config))
+    faults += _mapped_twice(roles)
     faults += _identifiers_shared(channels, database)
     if faults:
         raise ConfigError(faults)
@@ -170,24 +136,17 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         raise _Fault(f"unit is for the columns of a table: {signal.name} has the unit that the DBC says")
     if role.mapped.valid is not None and signal.name == WHOLE:
         raise _Fault("valid is for messages; of a column leave those cells empty that do not count")
+    factor, offset = _factor(role, signal), STANDARD_GRAVITY * role.mapped.unsprung_mass
     low, high = plausible(config, role.quantity, role.part)
     valid_signal, valid_values = _validity(message, role.mapped)
-    seldom = max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
+    timeout = role.mapped.timeout
+    if timeout is None and role.quantity in POSITION_ROLES:
+        timeout = max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
+    wheel = role.part.name if role.part else ""
     return Channel(
-        quantity=role.quantity,
-        wheel=role.part.name if role.part else "",
-        message=message.name,
-        signal=signal.name,
-        factor=_factor(role, signal),
-        offset=STANDARD_GRAVITY * role.mapped.unsprung_mass,
-        low=low,
-        high=high,
-        valid_signal=valid_signal,
-        valid_values=valid_values,
-        timeout=role.mapped.timeout or (seldom if role.quantity in POSITION_ROLES else None),
-        delay=role.mapped.delay,
-        key=role.where,
-    )
+        role.quantity, wheel, message.name, signal.name, factor, offset, low, high, valid_signal, valid_values,
+        timeout, role.mapped.delay, role.where,
+    )  # fmt: skip
 
 
 def found_signal(database: Database, path: str) -> tuple[Message, Signal]:
@@ -206,14 +165,14 @@ def _find_signal(message: Message, name: str) -> Signal:
     try:
         return check_decodable(message, name)
     except KeyError:
-        names = [s.name for s in message.signals]
-        raise _Fault(f"no signal {name} in message {message.name}{did_you_mean(name, names)}") from None
+        meant = did_you_mean(name, (s.name for s in message.signals))
+        raise _Fault(f"no signal {name} in message {message.name}{meant}") from None
     except ValueError as error:
         raise _Fault(str(error)) from None
 
 
 def _validity(message: Message, mapped: Mapped) -> tuple[str | None, tuple[int, ...]]:
-    """Name of the signal that vouches for the mapped one, and its codes that do; a fault when they never could."""
+    """Name of the signal that vouches for the mapped one, and its codes that do."""
     if mapped.valid is None:
         return None, ()
     before, dot, name = mapped.valid.rpartition(".")
@@ -222,9 +181,7 @@ def _validity(message: Message, mapped: Mapped) -> tuple[str | None, tuple[int, 
     signal = _find_signal(message, name)
     if signal.conversion.is_float:
         raise _Fault(f"valid = {mapped.valid} is a float; it must be a code")
-    codes = mapped.valid_values
-    if codes is None:
-        codes = list(vouching_codes(signal)) or [1]
+    codes = mapped.valid_values if mapped.valid_values is not None else list(vouching_codes(signal)) or [1]
     low, high = code_limits(signal)
     if not any(low <= code <= high for code in codes):
         raise _Fault(f"valid_values {codes} never occur in {mapped.valid}, which has {low}..{high}")
@@ -248,10 +205,9 @@ def _factor(role: _Role, signal: Signal) -> float:
     if dimension == "mass":
         factor *= STANDARD_GRAVITY
     elif dimension == "speed":
-        if at_shaft:
-            raise _Fault(f"{mapped.signal} is in {signal.unit}: a shaft has no speed along the ground")
-        if isinstance(part, Axle):
-            raise _Fault(f"{mapped.signal} is in {signal.unit}: a motor has no speed along the ground")
+        if at_shaft or isinstance(part, Axle):
+            turning = "shaft" if at_shaft else "motor"
+            raise _Fault(f"{mapped.signal} is in {signal.unit}: a {turning} has no speed along the ground")
         factor /= part.radius
     elif at_shaft and dimension == "torque":
         factor *= part.gear_ratio
@@ -262,40 +218,34 @@ def _factor(role: _Role, signal: Signal) -> float:
 
 def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
     """Dimension and factor to SI of a signal, which must suit the quantity; no unit means SI."""
-    fitting = DIMENSIONS[quantity]
+    fitting, said = DIMENSIONS[quantity], (signal.unit or "").strip()
+    name = signal.name or "the column"
+    here = f"{name} is in {said or 'no unit'}"
     if fitting == ("",):
         if _unit_said(signal):
-            raise _Fault(f"{_called(signal)} is in {signal.unit}; {quantity} is a state: 0, or 1 while locked")
+            raise _Fault(f"{here}; {quantity} is a state: 0, or 1 while locked")
         return "", 1.0
     for key, rule in _NUMBERS.items():
-        if (number := getattr(mapped, key)) is not None:
-            if quantity not in rule.roles:
-                raise _Fault(f"{key} has no meaning for {quantity}")
-            said = (signal.unit or rule.bare).strip()
-            if said not in rule.units:
-                raise _Fault(f"{_called(signal)} is in {said}; with {key} it must be {rule.wanted}")
+        number, is_meant = getattr(mapped, key), rule.dimension in fitting
+        if number is not None and not is_meant:
+            raise _Fault(f"{key} has no meaning for {quantity}")
+        if number is not None and said not in rule.units:
+            raise _Fault(f"{here}; with {key} it must be a {rule.what}")
+        if number is not None:
             return rule.dimension, number * rule.units[said]
+        if said and is_meant and said in rule.units:
+            raise _Fault(f"{here}, a {rule.what}: give its {key} [{rule.unit}]")
     wanted = " or ".join(SI[dimension] for dimension in fitting)
     try:
         unit = unit_of(signal.unit)
     except ValueError as error:
-        spelled = (signal.unit or "").strip()
-        for rule in _NUMBERS.values():
-            if rule.hint and spelled in rule.units and quantity in rule.roles:
-                raise _Fault(f"{_called(signal)} is in {spelled}, {rule.hint}") from None
-        raise _Fault(f"{_called(signal)}: {error} ({quantity} needs {wanted})") from None
-    if unit is None:
-        if quantity in POSITION_ROLES:
-            raise _Fault(f"{_called(signal)} has no unit: write deg or rad in the DBC")
-        return fitting[0], 1.0
-    if unit.dimension not in fitting:
+        raise _Fault(f"{name}: {error} ({quantity} needs {wanted})") from None
+    if unit is None and quantity in POSITION_ROLES:
+        raise _Fault(f"{name} has no unit: write deg or rad in the DBC")
+    if unit is not None and unit.dimension not in fitting:
         article = "an" if unit.dimension[0] in "ai" else "a"
-        raise _Fault(f"{_called(signal)} is in {signal.unit}, {article} {unit.dimension}; {quantity} needs {wanted}")
-    return unit.dimension, unit.factor
-
-
-def _called(signal: Signal) -> str:
-    return signal.name or "the column"
+        raise _Fault(f"{here}, {article} {unit.dimension}; {quantity} needs {wanted}")
+    return (fitting[0], 1.0) if unit is None else (unit.dimension, unit.factor)
 
 
 def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple[float, float]:
@@ -314,47 +264,37 @@ def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple
         return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
     if quantity == "sinkage":
         return -0.1 * radius, radius
-    greatest = {
-        "torque": 2.0 * weight * radius,
-        "torque_limit": 2.0 * weight * radius,
-        "speed": MAX_SPEED / radius,
-        "motor_speed": MAX_SPEED / radius,
-        "ground_speed": MAX_SPEED,
-        "draft": 2.0 * weight,
-        "pitch": 1.0,
-        "roll": 1.6,
-        "steering_angle": 1.6,
-        "acceleration": 20.0,
-        "yaw_rate": 4.0,  # a skid-steered rover on the spot
-        "latitude": math.pi / 2.0,
-        "longitude": math.pi + 1e-9,  # 180 degrees, however it is rounded
-    }.get(quantity, math.inf)
+    if quantity in ("torque", "torque_limit"):
+        greatest = 2.0 * weight * radius
+    elif quantity in ("speed", "motor_speed"):
+        greatest = MAX_SPEED / radius
+    else:
+        greatest = 2.0 * weight if quantity == "draft" else _GREATEST.get(quantity, math.inf)
     return -greatest, greatest
 
 
-def _mapped_twice(roles: Iterable[_Role]) -> list[str]:
-    """A signal that feeds two roles would count one sensor twice.
+_GREATEST = {
+    "ground_speed": MAX_SPEED, "pitch": 1.0, "roll": 1.6, "steering_angle": 1.6, "acceleration": 20.0,
+    "yaw_rate": 4.0,  # a skid-steered rover on the spot
+    "latitude": math.pi / 2.0, "longitude": math.pi + 1e-9,  # 180 degrees, however it is rounded
+}  # fmt: skip
 
-    One torque limit may hold for several wheels: a limit is not a measurement.  One torque, speed or load of several
-    wheels is one measurement, and counted as one.
-    """
+
+def _mapped_twice(roles: Iterable[_Role]) -> Iterator[str]:
+    """A line for each signal of two roles; limits of several wheels, or one measurement of several, are none."""
     first: dict[str, _Role] = {}
-    faults: list[str] = []
     for role in roles:
         known = first.setdefault(role.mapped.signal, role)
         of_wheels = isinstance(known.part, Wheel) and isinstance(role.part, Wheel)
         once = role.quantity == "torque_limit" or (of_wheels and role.quantity in SHARED_ROLES)
         if known is not role and not (once and known.quantity == role.quantity):
-            faults.append(f"{role.where}: {role.mapped.signal} is already mapped to {known.where}")
-    return faults
+            yield f"{role.where}: {role.mapped.signal} is already mapped to {known.where}"
 
 
-def _identifiers_shared(channels: Iterable[Channel], database: Database) -> list[str]:
+def _identifiers_shared(channels: Iterable[Channel], database: Database) -> Iterator[str]:
     owner: dict[tuple[int, bool], str] = {}
-    faults: list[str] = []
     for name in dict.fromkeys(c.message for c in channels):
         message = database.get_message_by_name(name)
         known = owner.setdefault((message.frame_id, message.is_extended_frame), name)
         if known != name:
-            faults.append(f"messages {known} and {name} have the same identifier {message.frame_id:#x}")
-    return faults
+            yield f"messages {known} and {name} have the same identifier {message.frame_id:#x}"

@@ -14,25 +14,23 @@ from typing import Any
 
 import can
 
-from soilbus.can.candump import Batch, Frame, of_message
+from soilbus.can.candump import Frame, Heard, of_message
 from soilbus.files import LIMITS, within_ratio
 
 _STAMP = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}}}
 _CHANNEL = {"type": "string", "description": "channel of the bus"}
-FRAME_SCHEMA = {
-    "title": "can_msgs/Frame",
-    "type": "object",
-    "properties": {
-        "header": {"type": "object", "properties": {"stamp": _STAMP, "frame_id": _CHANNEL}},
-        "id": {"type": "integer", "description": "identifier, without flags"},
-        "is_rtr": {"type": "boolean"},
-        "is_extended": {"type": "boolean"},
-        "is_error": {"type": "boolean"},
-        "dlc": {"type": "integer", "description": "bytes of data"},
-        "data": {"type": "array", "items": {"type": "integer"}},
-    },
-    "required": ["header", "id", "is_rtr", "is_extended", "is_error", "dlc", "data"],
+_PROPERTIES = {
+    "header": {"type": "object", "properties": {"stamp": _STAMP, "frame_id": _CHANNEL}},
+    "id": {"type": "integer", "description": "identifier, without flags"},
+    "is_rtr": {"type": "boolean"},
+    "is_extended": {"type": "boolean"},
+    "is_error": {"type": "boolean"},
+    "dlc": {"type": "integer", "description": "bytes of data"},
+    "data": {"type": "array", "items": {"type": "integer"}},
 }
+FRAME_SCHEMA = {
+    "title": "can_msgs/Frame", "type": "object", "properties": _PROPERTIES, "required": list(_PROPERTIES)
+}  # fmt: skip
 
 
 def nanoseconds(t: float) -> int:
@@ -46,27 +44,21 @@ def frame_message(channel: str, frame: Frame) -> dict[str, Any]:
     t, identifier, is_extended, data, is_remote, is_error = frame
     sec, nanosec = divmod(nanoseconds(t), 10**9)
     return {
-        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": channel},
-        "id": identifier,
-        "is_rtr": is_remote,
-        "is_extended": is_extended,
-        "is_error": is_error,
-        "dlc": len(data),
-        "data": list(data),
-    }
+        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": channel}, "id": identifier,
+        "is_rtr": is_remote, "is_extended": is_extended, "is_error": is_error, "dlc": len(data), "data": list(data),
+    }  # fmt: skip
 
 
-def frame_batches(stream: BufferedReader) -> Iterator[Batch]:
+def mcap_frames(stream: BufferedReader) -> Iterator[Heard]:
     """Yield the frames of an MCAP log in the order of the file; ValueError where it has none."""
     try:
         from mcap.records import Channel, Message, Schema
     except ModuleNotFoundError:
         raise ModuleNotFoundError("this format needs soilbus[mcap]") from None
-    schemas: set[int] = set()
-    channels: set[int] = set()
-    is_empty = True
+    title = FRAME_SCHEMA["title"]
+    schemas, channels, is_empty = set(), set(), True
     for record in _records(stream):
-        if isinstance(record, Schema) and record.name == FRAME_SCHEMA["title"]:
+        if isinstance(record, Schema) and record.name == title:
             schemas.add(record.id)
         elif isinstance(record, Channel) and record.schema_id in schemas and record.message_encoding == "json":
             channels.add(record.id)
@@ -74,7 +66,7 @@ def frame_batches(stream: BufferedReader) -> Iterator[Batch]:
             is_empty = False
             yield of_message(_message(record.data))
     if is_empty:
-        raise ValueError(f"it has no CAN frames: no JSON message of schema {FRAME_SCHEMA['title']}")
+        raise ValueError(f"it has no CAN frames: no JSON message of schema {title}")
 
 
 def _message(data: bytes) -> can.Message:

@@ -1,7 +1,6 @@
 """Results -> frames: value codes, counter, checksum.
 
-Which value goes into which signal is the caller's business; what happens to a value that
-cannot be sent is decided here, once for all signals, from what the DBC says of them.
+What happens to a value that cannot be sent is decided here, once for all signals, from what the DBC says of them.
 """
 
 from __future__ import annotations
@@ -9,8 +8,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, checksum_byte, frame_checksum
+from soilbus.can.decode import code_limits
 
 NOT_AVAILABLE, ERROR = "not_available", "error"
 _BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
@@ -35,13 +34,11 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class ValueCodes:
-    """Conversion of values of one integer signal to raw codes.
+    """Conversion of values of one integer signal to raw codes: physical value = scale * code + offset.
 
-    Physical value = scale * code + offset.  Valid codes are lowest..highest.  None and
-    what is not finite become `not_available`.  A value outside the range becomes `error`,
-    never the nearest valid one, since the receiver would take that for a measurement;
-    except that signals with the attribute `Saturates` (standard deviations, ages, counts:
-    "this much or more") stay at the top of their range.  `names` is the value table.
+    Valid codes are lowest..highest.  None and what is not finite become `not_available`.  A value outside the range
+    becomes `error`, never the nearest valid one, which would be taken for a measurement; but signals with the attribute
+    `Saturates` (deviations, ages, counts: "this much or more") stay at the top.  `names` is the value table.
     """
 
     lowest: int
@@ -54,10 +51,7 @@ class ValueCodes:
     names: Mapping[str, int]
 
     def code(self, value: Any) -> int:
-        """Return the raw code of one value: number, name of the value table, or None.
-
-        Raises ValueError for an unknown name, TypeError for what is no value at all.
-        """
+        """Return the raw code of a number, a name of the value table, or None; else ValueError or TypeError."""
         if value is None:
             return self.not_available
         if isinstance(value, str):
@@ -84,22 +78,22 @@ class ValueCodes:
 
 
 def value_codes(signal: Signal) -> ValueCodes:
-    """Return the conversion for a signal of any maker's DBC.
+    """Return the conversion for a signal of any maker's DBC; ValueError where it cannot be sent.
 
-    Without names in the value table, not available is the most negative code of a signed
-    signal and all ones of an unsigned one; error is the J1939 code where the range leaves
-    it free, else not available.  Raises ValueError for float signals, for more than 32 bits, and for a
-    code that the bits cannot hold.
+    Without names in the value table, not available is the most negative code of a signed signal and all ones of an
+    unsigned one; error is the J1939 code where the range leaves it free, else not available.
     """
     if signal.is_float or signal.length > 32:
         raise ValueError(f"{signal.name}: only integer signals up to 32 bits can be sent")
-    least = -(1 << signal.length - 1) if signal.is_signed else 0
-    greatest = least + (1 << signal.length) - 1
+    least, greatest = code_limits(signal)
     names = {str(name): int(code) for code, name in (signal.choices or {}).items()}
     if wide := [name for name, code in names.items() if not least <= code <= greatest]:
         raise ValueError(f"{signal.name}: {', '.join(wide)} of the value table does not fit into {signal.length} bits")
     not_available = names.get(NOT_AVAILABLE, least if signal.is_signed else greatest)
-    lowest, highest = _valid_codes(signal, least, greatest)
+    bounds = (signal.minimum, signal.maximum)
+    ends = [None if bound is None else round((bound - signal.offset) / signal.scale) for bound in bounds]
+    low, high = reversed(ends) if signal.scale < 0 else ends
+    lowest, highest = least if low is None else max(low, least), greatest if high is None else min(high, greatest)
     if NOT_AVAILABLE not in names and signal.length >= 8:  # a range of all codes means all but this one
         lowest, highest = lowest + (lowest == not_available), highest - (highest == not_available)
     free = 0xFE << signal.length - 8 if signal.length >= 8 and not signal.is_signed else greatest
@@ -109,14 +103,6 @@ def value_codes(signal: Signal) -> ValueCodes:
     return ValueCodes(
         lowest, highest, not_available, error, float(signal.scale), float(signal.offset), saturates, names
     )
-
-
-def _valid_codes(signal: Signal, least: int, greatest: int) -> tuple[int, int]:
-    """First and last code within the DBC's range, of those that the bits can hold."""
-    bounds = (signal.minimum, signal.maximum)
-    ends = [None if bound is None else round((bound - signal.offset) / signal.scale) for bound in bounds]
-    low, high = reversed(ends) if signal.scale < 0 else ends
-    return least if low is None else max(low, least), greatest if high is None else min(high, greatest)
 
 
 @dataclass(slots=True)
@@ -129,7 +115,7 @@ class _Layout:
     blank: dict[str, int]
     counter_modulus: int
     checksum_byte: int | None
-    sent: int = field(default=0)
+    sent: int = 0
 
 
 class Publisher:
@@ -138,17 +124,14 @@ class Publisher:
     def __init__(self, database: Database) -> None:
         """Raises ValueError for a message without cycle time or with a signal it cannot fill."""
         self._layouts = {message.name: _layout(message) for message in database.messages}
-        self.schedule: Mapping[str, float] = MappingProxyType(
-            {name: layout.cycle_time for name, layout in self._layouts.items()}
-        )
+        self.schedule = {name: layout.cycle_time for name, layout in self._layouts.items()}
         """Cycle time [s] by message name, from the DBC's attribute GenMsgCycleTime."""
 
     def frame(self, message: str, values: Mapping[str, Any]) -> Frame:
         """Return the next frame of a message; signals without a value are sent as not available.
 
-        Values are in the DBC's units, or names of the value table.  Raises KeyError for a
-        message or signal that the DBC does not have (counter and checksum are not the
-        caller's), ValueError and TypeError as `ValueCodes.code`.
+        Values are in the DBC's units, or names of the value table.  Raises KeyError for a message or signal that is not
+        in the DBC, counter and checksum included; ValueError and TypeError as `ValueCodes.code`.
         """
         layout = self._layouts[message]
         raw = layout.blank.copy()

@@ -5,7 +5,7 @@
 
 A slot is a role at a place ("torque" at "FL", "load" at "rear", "draft").  A match is asserted where its score reaches
 ASSERTED and beats the next free candidate of its slot by MARGIN; anything else stays open and lists its candidates.
-The weights are judgement, held by the share of roles right, wrong and open on the DBCs of tests/proposal.
+The weights are judgement, held by the roles right, wrong and open on the DBCs of tests/proposal.
 """
 
 from __future__ import annotations
@@ -29,64 +29,51 @@ from soilbus.can.units import Unit, unit_of
 
 _LETTERS = {"front": "F", "middle": "M", "rear": "R", **{str(k): str(k) for k in range(1, 5)}}
 """Letter of the wheels of each axle, front to rear; four axles have numbers."""
-AXLES = (*_LETTERS, "both")
-"""Places of axles; `both` for one motor that drives all of them."""
+AXLES = (*_LETTERS, "both")  # places of axles; `both` for one motor that drives all of them
 WHEELS = frozenset(letter + side for letter in _LETTERS.values() for side in "LR")
-"""Places of wheels: an axle's letter, and L or R."""
-ASSERTED = 1.0
-"""Score from which a match is asserted: the unit fits and at least one strong word of the role stands in a name."""
-MARGIN = 0.3
-"""Score by which it must beat the next candidate: less than one word."""
-LISTED = 0.25
-"""Score from which a candidate is worth a line."""
-SOLE = 0.5
-"""Score from which the only candidate of a slot is taken: half of what an asserted match needs."""
-ONLY = "the only candidate"
-"""Note on a match that was taken because there is no other."""
+ASSERTED = 1.0  # score from which a match is asserted: the unit fits and a strong word of the role stands in a name
+MARGIN = 0.3  # score by which it must beat the next candidate: less than one word
+LISTED = 0.25  # score from which a candidate is worth a line
+SOLE = 0.5  # score from which the only candidate of a slot is taken: half of what an asserted match needs
+ONLY = "the only candidate"  # note on a match that was taken because there is no other
+NEEDS = "with "  # begin of a note on a number that the DBC does not have
 IN_MESSAGE, IN_COMMENT = 0.7, 0.5
 """Share of a word's weight where it stands in the message's name or in the comment, not in the signal's own name."""
+HINT = 0.25  # the same of a word against a role, where the signal's own name speaks for it
 
-HINT = 0.25
-"""The same of a word against a role, where the signal's own name speaks for it."""
-
-_ABBREVIATIONS: Mapping[str, str] = {
-    "torque": "tq trq trque torq", "speed": "spd vel velocity rpm sog revolution wss",
-    "motor": "mot mtr mcu inv inverter emotor drv",
-    "shaft": "rotor", "wheel": "whl wh tyre tire wss", "axle": "axl", "load": "ld wgt wght weight fz scale",
-    "draft": "drft draught dft", "pull": "tow traction drawbar", "hitch": "htch linkage implement impl pin",
+_SPELLINGS: Mapping[str, str] = {
+    "torque": "tq trq trque torq moment mom drehmoment drehmom",
+    "speed": "spd vel velocity rpm sog revolution wss drehzahl drehz geschwindigkeit geschw"
+    " raddrehzahl raddrehz raddrehzahlen",
+    "motor": "mot mtr mcu inv inverter emotor drv asm psm antrieb", "shaft": "rotor",
+    "wheel": "whl wh tyre tire wss raddrehzahl raddrehz raddrehzahlen radlast radlasten",
+    "axle": "axl achse achslast achslasten",
+    "load": "ld wgt wght weight fz scale radlast radlasten achslast achslasten", "draft": "drft draught dft zugkraft",
+    "pull": "tow traction drawbar", "hitch": "htch linkage implement impl pin",
     "ground": "gnd radar gps gnss sog doppler overground", "sinkage": "sink rut", "height": "hgt ride",
-    "pitch": "ptch", "slope": "grade inclination incline", "roll": "bank", "yaw": "gz", "rate": "rt",
-    "acceleration": "acc accel accelerometer", "longitudinal": "lgt lon long along forward x ax",
-    "lateral": "lat y ay", "vertical": "vert z az", "steering": "steer str eps mdps", "angle": "ang",
-    "force": "frc", "relative": "rel",
-    "latitude": "lat", "longitude": "lon long lng", "position": "pos gps gnss",
-    "differential": "diff", "lock": "locked lck",
-    "limit": "lim max maximum avail available avl greatest", "least": "min minimum",
-    "request": "req requested cmd command commanded demand dmd setpoint setpt sp target tgt desired des ref reference",
-    "actual": "act fbk feedback fb measured meas estimated est real", "pto": "powertakeoff", "engine": "eng ice",
-    "brake": "brk braking", "vehicle": "veh machine motion", "odometer": "odo", "valid": "ok qualifier vld",
-    "state": "status stat", "current": "curr cur amps iq",
-    "front": "frnt frt fnt fwd", "middle": "mid mitte",
-    "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
+    "pitch": "ptch nick nickwinkel", "slope": "grade inclination incline neigung", "roll": "bank wank wankwinkel",
+    "yaw": "gz gier gierrate", "rate": "rt gierrate",
+    "acceleration": "acc accel accelerometer beschleunigung beschl laengsbeschl querbeschl",
+    "longitudinal": "lgt lon long along forward x ax laengs laengsbeschl", "lateral": "lat y ay quer querbeschl",
+    "vertical": "vert z az", "steering": "steer str eps mdps lenk lenkwinkel",
+    "angle": "ang winkel lenkwinkel nickwinkel wankwinkel", "force": "frc kraft", "relative": "rel",
+    "latitude": "lat", "longitude": "lon long lng", "position": "pos gps gnss", "differential": "diff",
+    "lock": "locked lck", "limit": "lim max maximum avail available avl greatest", "least": "min minimum",
+    "request": "req requested cmd command commanded demand dmd setpoint setpt sp target tgt desired des ref reference"
+    " soll sollwert",
+    "actual": "act fbk feedback fb measured meas estimated est real ist istwert", "pto": "powertakeoff",
+    "engine": "eng ice", "brake": "brk braking", "vehicle": "veh machine motion", "odometer": "odo",
+    "valid": "ok qualifier vld", "state": "status stat zustand", "current": "curr cur amps iq",
+    "front": "frnt frt fnt fwd vorn vorne", "middle": "mid mitte", "rear": "re rer back hind hinten",
+    "left": "lft lh links", "right": "rght rgt rh rechts",
 }  # fmt: skip
-_GERMAN: Mapping[str, str] = {
-    "torque": "moment mom drehmoment drehmom",
-    "speed": "drehzahl drehz geschwindigkeit geschw raddrehzahl raddrehz raddrehzahlen",
-    "motor": "asm psm antrieb", "wheel": "raddrehzahl raddrehz raddrehzahlen radlast radlasten",
-    "axle": "achse achslast achslasten", "load": "radlast radlasten achslast achslasten",
-    "draft": "zugkraft", "force": "kraft", "pitch": "nick nickwinkel", "roll": "wank wankwinkel",
-    "yaw": "gier gierrate", "rate": "gierrate", "acceleration": "beschleunigung beschl laengsbeschl querbeschl",
-    "longitudinal": "laengs laengsbeschl", "lateral": "quer querbeschl", "steering": "lenk lenkwinkel",
-    "angle": "winkel lenkwinkel nickwinkel wankwinkel", "slope": "neigung", "request": "soll sollwert",
-    "actual": "ist istwert", "state": "zustand", "front": "vorn vorne", "rear": "hinten", "left": "links",
-    "right": "rechts",
-}  # fmt: skip
+"""Abbreviations, synonyms and German words of each word."""
 _OTHER = (
     "force specific hand column pump fan cruise gravity course cog fraction coverage distance direction travel steady"
     " temperature voltage counter checksum percent rated loss friction north east up down link lift position"
 )
 _WORDS: dict[str, frozenset[str]] = {}
-for _word, _short in (*_ABBREVIATIONS.items(), *_GERMAN.items()):
+for _word, _short in _SPELLINGS.items():
     for _spelling in (_word, *_short.split()):
         _WORDS[_spelling] = _WORDS.get(_spelling, frozenset()) | {_word}
 for _spelling in _OTHER.split():
@@ -110,74 +97,43 @@ _ASKED = frozenset({"request", "least", "rated"})
 _HITCH = frozenset({"hitch", "draft", "pull", "link"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
 _ROLES: Mapping[str, tuple[float, Mapping[str, float], frozenset[str]]] = {
-    "torque": (
-        0.6,
-        {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
-        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"},
-    ),
+    "torque": (0.6, {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
+        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"}),
     "torque_limit": (0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
-    "motor_speed": (
-        0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
-        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"},
-    ),
-    "speed": (
-        0.1, {"wheel": 0.8, "speed": 0.2},
-        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"},
-    ),
-    "load": (
-        0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
-        _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"},
-    ),
+    "motor_speed": (0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
+        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit", "relative"}),
+    "speed": (0.1, {"wheel": 0.8, "speed": 0.2},
+        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground", "relative", "load", "torque"}),
+    "load": (0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
+        _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"}),
     "sinkage": (0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
-    "ground_speed": (
-        0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
-        _ASKED
-        | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"}
-        | {"relative"},
-    ),
-    "draft": (
-        0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
-        _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"},
-    ),
-    "pitch": (
-        0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
-        _ASKED | {"rate", "roll", "lateral", "steering", "hitch"},
-    ),
-    "roll": (
-        0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
-        _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"},
-    ),
-    "yaw_rate": (
-        0.1, {"yaw": 1.0, "rate": 0.2},
-        _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"},
-    ),
-    "acceleration": (
-        0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
-        _ASKED | {"lateral", "vertical", "limit"},
-    ),
-    "steering_angle": (
-        0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
-        _ASKED | {"hand", "column", "rate", "limit", "fraction"},
-    ),
+    "ground_speed": (0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
+        _ASKED | {"wheel", "axle", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor",
+         "coverage", "relative"}),
+    "draft": (0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
+        _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"}),
+    "pitch": (0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
+        _ASKED | {"rate", "roll", "lateral", "steering", "hitch"}),
+    "roll": (0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
+        _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"}),
+    "yaw_rate": (0.1, {"yaw": 1.0, "rate": 0.2},
+        _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"}),
+    "acceleration": (0.2, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
+        _ASKED | {"lateral", "vertical", "limit"}),
+    "steering_angle": (0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
+        _ASKED | {"hand", "column", "rate", "limit", "fraction"}),
     "latitude": (0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
     "longitude": (0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
     "differential_lock": (0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
 }  # fmt: skip
 """Of each role: score of a fitting unit, weights of words, words that speak against it."""
-FEWEST_BITS = 7
-"""Length of the shortest signal that measures anything; shorter ones are codes and flags."""
-COARSEST_POSITION = 2e-5
-"""Resolution [rad] up to which a signal alone can be a latitude: 130 m."""
-_AGAINST = 1.5
-"""Score that a word against a role costs."""
-_NO_UNIT = 0.4
-"""Score that a missing unit costs."""
+FEWEST_BITS = 7  # length of the shortest signal that measures anything; shorter ones are codes and flags
+COARSEST_POSITION = 2e-5  # resolution [rad] up to which a signal alone can be a latitude: 130 m
+_AGAINST = 1.5  # score that a word against a role costs
+_NO_UNIT = 0.4  # score that a missing unit costs
 WHEEL_AND_AXLE = frozenset({"torque", "torque_limit", "motor_speed", "load"})
 WHEEL_ONLY = frozenset({"speed", "sinkage"})
-
-
-UNIT_ALONE = ""
-"""In the place of a role: a signal whose unit is one of ours, and whose name says nothing."""
+UNIT_ALONE = ""  # in the place of a role: a signal whose unit is one of ours, and whose name says nothing
 
 
 class Slot(NamedTuple):
@@ -196,17 +152,10 @@ class Candidate:
     signal: str
     score: float
     unit: str
-    factor: float
-    """SI value of one unit of the DBC; 1 without a unit."""
+    factor: float  # SI value of one unit of the DBC; 1 without a unit
     dimension: str
     notes: tuple[str, ...] = ()
-    absent: bool = False
-    """Whether a log has no value of it."""
-
-    @property
-    def needs_number(self) -> bool:
-        """Whether it is a torque only with a number that the DBC does not have."""
-        return any(note.startswith("with ") for note in self.notes)
+    absent: bool = False  # whether a log has no value of it
 
     @property
     def path(self) -> str:
@@ -220,8 +169,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Result of the matching: asserted signals by slot, candidates of open slots, rivals of asserted ones, and
-    signals of which only the unit is known."""
+    """Asserted signals by slot, candidates of open slots, rivals of asserted ones, signals with only a unit."""
 
     asserted: dict[Slot, Candidate] = field(default_factory=dict)
     open: dict[Slot, list[Candidate]] = field(default_factory=dict)
@@ -230,14 +178,9 @@ class Assignment:
 
 
 def candidates(database: Database) -> list[Candidate]:
-    """Return every signal for every slot that it may fill, with a score from LISTED up.
+    """Return every signal of the vehicle's bus for every slot that it may fill, with a score from LISTED up.
 
     A signal that may fill none, but has a unit of ours, is one of UNIT_ALONE with score 0.
-
-    Parameters
-    ----------
-    database
-        Messages of the vehicle's bus.
     """
     names = frozenset(name for m in database.messages for name in (m.name, *(s.name for s in m.signals)))
     said = {place for m in database.messages for s in m.signals for text in _texts(m, s) if (place := _place(text))}
@@ -254,13 +197,7 @@ def axles_of(assignment: Assignment) -> dict[str, tuple[str, str]]:
 
 
 def assigned(found: Iterable[Candidate]) -> Assignment:
-    """Assign each signal to one slot by the largest sum of scores; what is not clear stays open.
-
-    Returns
-    -------
-    Assignment
-        Slots of a role that can belong to wheels or axles without a place are open always.
-    """
+    """Assign each signal to one slot by the largest sum of scores; what is not clear stays open."""
     from scipy.optimize import linear_sum_assignment
 
     best: dict[tuple[Slot, str], Candidate] = {}
@@ -297,13 +234,8 @@ def _take_sole(out: Assignment) -> None:
     uses = Counter(c.path for cs in out.open.values() for c in cs)
     for slot, (first, *others) in list(out.open.items()):
         is_whole = slot.role not in WHEEL_ONLY | WHEEL_AND_AXLE or slot.place
-        if (
-            is_whole
-            and not others
-            and uses[first.path] == 1
-            and first.score >= SOLE
-            and not first.absent | first.needs_number
-        ):
+        is_known = not first.absent and not any(note.startswith(NEEDS) for note in first.notes)
+        if is_whole and is_known and not others and uses[first.path] == 1 and first.score >= SOLE:
             out.asserted[slot] = first.changed(0.0, ONLY)
             del out.open[slot]
 
@@ -342,9 +274,8 @@ def _known_places(said: set[str]) -> dict[str, str]:
 
 
 def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: Mapping[str, str]) -> list[Candidate]:
-    comment = signal.comment or ""
-    texts = _texts(message, signal)
-    place = next((p for text in texts if (p := known.get(_place(text)) or _axle_by_letter(text, names))), "")
+    places = (known.get(_place(text)) or _axle_by_letter(text, names) for text in _texts(message, signal))
+    place = next(filter(None, places), "")
     try:
         unit = unit_of(signal.unit)
     except ValueError:
@@ -353,6 +284,7 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: M
     own, around = _words(_own_name(message, signal)), _words(message.name) | _GROUPS.get(group, frozenset())
     if signal.name == WHOLE:
         around = own
+    comment = _words(signal.comment or "")
     found = []
     for role in _ROLES:
         dimensions = DIMENSIONS[role]
@@ -361,34 +293,38 @@ def _of_signal(message: Message, signal: Signal, names: frozenset[str], known: M
         if signal.length < FEWEST_BITS and dimensions != ("",):
             continue
         at_wheel = place in WHEELS
-        score = _score(role, own, around, _words(comment), unit, at_wheel) + _by_range(role, signal, unit, own)
+        score = _score(role, own, around, comment, unit is not None, at_wheel) + _by_range(role, signal, unit, own)
         slot = Slot(role, place if role in WHEEL_AND_AXLE or (role in WHEEL_ONLY and at_wheel) else "")
         notes: tuple[str, ...] = ("no unit: SI assumed",) if unit is None and dimensions != ("",) else ()
         if role in WHEEL_ONLY and slot.place not in WHEELS:
             notes += ("not of one wheel",)
         if score >= LISTED:
-            factor, dimension = (unit.factor, unit.dimension) if unit is not None else (1.0, dimensions[0])
-            found.append(Candidate(slot, message.name, signal.name, score, signal.unit or "", factor, dimension, notes))
+            found.append(_candidate(slot, message, signal, score, unit or Unit(dimensions[0], 1.0), notes))
     if not found and unit is not None and signal.length >= FEWEST_BITS and not own & (_ASKED | _OTHER_MACHINES):
-        slot = Slot(UNIT_ALONE, place)
-        said = ("relative to another",) if "relative" in own else ()
-        unnamed = Candidate(slot, message.name, signal.name, 0.0, signal.unit or "", unit.factor, unit.dimension, said)
-        found.append(unnamed)
+        notes = ("relative to another",) if "relative" in own else ()
+        found.append(_candidate(Slot(UNIT_ALONE, place), message, signal, 0.0, unit, notes))
     return found
+
+
+def _candidate(
+    slot: Slot, message: Message, signal: Signal, score: float, unit: Unit, notes: tuple[str, ...]
+) -> Candidate:
+    return Candidate(slot, message.name, signal.name, score, signal.unit or "", unit.factor, unit.dimension, notes)
 
 
 def _indirect(message: Message, signal: Signal, place: str) -> list[Candidate]:
     """A percentage or a current, which is a torque with a number that the DBC does not have: never asserted."""
     own, around, unit = _words(_own_name(message, signal)), _words(message.name), (signal.unit or "").strip()
+    if unit == "%" and "torque" in own:
+        number = "reference_torque"
+    elif unit in ("A", "mA", "kA") and "current" in own and "motor" in own | around:
+        number = "torque_constant"
+    else:
+        return []
     if own & _ASKED or "limit" in own:
         return []
-    note = ""
-    if unit == "%" and "torque" in own:
-        note = "with reference_torque"
-    elif unit in ("A", "mA", "kA") and "current" in own and "motor" in own | around:
-        note = "with torque_constant"
-    slot, score = Slot("torque", place), (LISTED + ASSERTED) / 2.0
-    return [Candidate(slot, message.name, signal.name, score, unit, 1.0, "torque", (note,))] if note else []
+    score, notes = (LISTED + ASSERTED) / 2.0, (NEEDS + number,)
+    return [_candidate(Slot("torque", place), message, signal, score, Unit("torque", 1.0), notes)]
 
 
 def _own_name(message: Message, signal: Signal) -> str:
@@ -397,19 +333,14 @@ def _own_name(message: Message, signal: Signal) -> str:
 
 
 def _score(
-    role: str,
-    own: frozenset[str],
-    around: frozenset[str],
-    comment: frozenset[str],
-    unit: Unit | None,
-    at_wheel: bool,
+    role: str, own: frozenset[str], around: frozenset[str], comment: frozenset[str], has_unit: bool, at_wheel: bool
 ) -> float:
     base, weights, against = _ROLES[role]
     if at_wheel:
         against = against - _HITCH  # a load pin is in a wheel's hub, too
         around = around | {"wheel"} if role == "speed" else around
     is_bare = not own - {"front", "middle", "rear", "speed"}  # it only says where, or how fast: the message says what
-    score = base if unit is not None or DIMENSIONS[role] == ("",) else -_NO_UNIT
+    score = base if has_unit or DIMENSIONS[role] == ("",) else -_NO_UNIT
     for word, weight in weights.items():
         share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
         score += weight * max(share, IN_COMMENT if word in comment else 0.0)
@@ -448,15 +379,13 @@ def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str])
 # --- words ---
 
 
-PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"
-"""A piece of a name: names are parted at underscores, capitals and digits."""
+PIECE = r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+"  # names are parted at underscores, capitals and digits
 
 
 @cache
 def _tokens(text: str) -> tuple[str, ...]:
     """Pieces of a name: at underscores, capitals and digits, and whole words run together."""
-    pieces = re.findall(PIECE, text)
-    small = [piece.casefold() for piece in pieces]
+    small = [piece.casefold() for piece in re.findall(PIECE, text)]
     singular = (p[:-1] if p not in _WORDS and p[:-1] in _WORDS and p.endswith("s") else p for p in small)
     return tuple(part for piece in singular for part in _parted(piece))
 
@@ -478,11 +407,10 @@ def _axle_by_letter(text: str, names: frozenset[str]) -> str:
     """front or rear by a letter of its own ("MCU_F_Tq"), where the DBC has the other axle's name, too."""
     found = set()
     for letter in re.finditer(PIECE, text):
-        if (token := letter[0].casefold()) in _AXLE_LETTERS:
-            other, axle = _AXLE_LETTERS[token]
-            other = other.upper() if letter[0].isupper() else other
-            if text[: letter.start()] + other + text[letter.end() :] in names:
-                found.add(axle)
+        other, axle = _AXLE_LETTERS.get(letter[0].casefold(), ("", ""))
+        other = other.upper() if letter[0].isupper() else other
+        if other and text[: letter.start()] + other + text[letter.end() :] in names:
+            found.add(axle)
     return min(found) if len(found) == 1 else ""
 
 
@@ -504,9 +432,8 @@ def _place(text: str) -> str:
     along = along or {number for _, number in beside if number in _LETTERS}
     if len(along) == len(across) == 1:
         return _LETTERS[min(along)] + {"left": "L", "right": "R"}[min(across)]
-    corners = {_CORNERS[t] for t in tokens if t in _CORNERS}
     letters = [a + b for a, b in pairwise(tokens) if len(a) == len(b) == 1]
-    corners |= {_CORNERS[pair] for pair in letters if pair in _CORNERS}
+    corners = {_CORNERS[t] for t in (*tokens, *letters) if t in _CORNERS}
     corners = corners or {_NUMBERED[pair] for pair in letters if pair in _NUMBERED}
     if len(corners) == 1 and not along and not across:
         return min(corners)

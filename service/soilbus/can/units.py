@@ -27,6 +27,7 @@ SI = {
     "acceleration": "m/s^2",
 }
 """SI unit of each dimension."""
+_RPM = math.pi / 30.0
 
 _SPELLINGS: dict[tuple[str, float], str] = {
     ("torque", 1.0): "nm n.m n*m n-m newtonmeter newtonmetre",
@@ -35,10 +36,7 @@ _SPELLINGS: dict[tuple[str, float], str] = {
     ("torque", 1.3558179483314004): "lbft lbfft lbf.ft lb.ft ftlb ft.lb ft.lbf",
     ("rotation", 1.0): "rad/s rad/sec rad.s-1 rads-1",
     ("rotation", 2.0 * math.pi): "rev/s r/s rps turns/s u/s tr/s",
-    (
-        "rotation",
-        math.pi / 30.0,
-    ): "rpm 1/min r/min rev/min u/min min-1 /min rot/min tr/min tr/mn giri/min obr/min ot/min",
+    ("rotation", _RPM): "rpm 1/min r/min rev/min u/min min-1 /min rot/min tr/min tr/mn giri/min obr/min ot/min",
     ("rotation", math.pi / 180.0): "deg/s deg/sec °/s degree/s degrees/s",
     ("force", 1.0): "n newton newtons",
     ("force", 10.0): "dan",
@@ -79,17 +77,13 @@ _SAME_CHARACTER = str.maketrans(
 )
 
 _WHY_NOT = {
-    "%": "a percentage is not a quantity of its own; give the signal that carries the physical value,"
-    " or for a torque its reference_torque",
+    "%": "a percentage is not a quantity of its own; give the signal that carries the physical value",
     "hz": "Hz may be turns or sensor pulses; write rpm, rev/s or rad/s in the DBC",
 }
 
 
 def unit_of(text: str | None) -> Unit | None:
-    """Return the unit that a DBC's text means; None when it is empty.
-
-    Raises ValueError, with the reason, for a text that names no unit known here.
-    """
+    """Return the unit that a DBC's text means, None when it is empty; ValueError says why it is none of ours."""
     tidy = (text or "").translate(_SAME_CHARACTER).replace("**", "").replace("(", "").replace(")", "")
     tidy = "".join(tidy.split()).removeprefix("[").removesuffix("]")
     if not tidy or tidy in ("-", "1"):
@@ -101,10 +95,7 @@ def unit_of(text: str | None) -> Unit | None:
 
 
 def _prefixed(tidy: str) -> Unit | None:
-    """The unit of a text with M or m before one of newtons; None for another text.
-
-    Raises ValueError where all is in capitals (MNM): the case of the prefix then says nothing.
-    """
+    """The unit of a text with M or m before one of newtons, None for another; of MNM the case says nothing."""
     prefix, rest = tidy[:1], tidy[1:].casefold()
     unit = _UNITS.get(rest) if prefix in _MEGA_MILLI and rest.startswith("n") else None
     if unit is None:

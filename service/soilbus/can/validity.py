@@ -1,8 +1,7 @@
 """Which decoded samples count, and why the others do not; never a zero for a missing value.
 
-Sources: SAE J1939-71 and ISO 11783-7 (top codes of a range: valid to 0xFA.., error 0xFE..,
-not available 0xFF..); the field's habit of keeping the most negative code of a signed signal
-for "not available".
+Sources: SAE J1939-71 and ISO 11783-7 (top codes of a range: valid to 0xFA.., error 0xFE.., not available 0xFF..); the
+field's habit of keeping the most negative code of a signed signal for "not available".
 """
 
 from __future__ import annotations
@@ -20,13 +19,7 @@ from numpy.typing import NDArray
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn, code_limits
 
-__all__ = [
-    "REASONS", "CodeRule", "Verdicts", "in_si", "judge_codes", "judge_validity", "meaning", "rule_of", "vouches",
-    "vouching_codes"
-]  # fmt: skip
-
-REASONS = tuple(Reason)
-"""A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
+REASONS = tuple(Reason)  # a sample's verdict v: 0 admitted, else refused for REASONS[v - 1]
 
 Verdicts = NDArray[np.uint8]
 
@@ -47,9 +40,8 @@ _OF_WHAT = re.compile(r"\b(signal|data|values?|status|state|quality|measurement|
 class CodeRule:
     """Rule which raw codes of a signal carry a value.
 
-    `low`..`high` are raw codes for integer signals and physical values for float signals (the
-    DBC's range, or all that the bits can hold); `bands` the first reserved, error and
-    not-available codes, where the range leaves them out; `special` single codes with a meaning of their own.
+    `low`..`high` are raw codes, of float signals physical values; `bands` the first reserved, error and not-available
+    codes, where the range leaves them out; `special` single codes with a meaning of their own.
     """
 
     low: float
@@ -60,10 +52,7 @@ class CodeRule:
 
 
 def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
-    """Return the rule that a signal's DBC entry implies.
-
-    `is_standard`: of a parameter group of the standards, where the top codes are no values, whatever the DBC's range.
-    """
+    """Return the rule of a signal's DBC entry; in a group of the standards the top codes never are values."""
     named = tuple((code, reason) for code, name in (signal.choices or {}).items() if (reason := meaning(str(name))))
     if signal.conversion.is_float:
         low = -math.inf if signal.minimum is None or not _has_range(signal) else float(signal.minimum)
@@ -157,21 +146,13 @@ def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArra
 
 
 def _has_range(signal: Signal) -> bool:
-    if signal.minimum is None and signal.maximum is None:
-        return False
-    return not signal.minimum == signal.maximum == 0
+    return not (signal.minimum == signal.maximum and signal.minimum in (None, 0))
 
 
 def _code_range(signal: Signal, first: int, last: int) -> tuple[int, int]:
-    """Least and greatest raw code within the DBC's range.
-
-    Printed limits are often rounded (4095.8 for 4095.875), so a limit between two codes
-    admits the outer one.
-    """
-    if not _has_range(signal):
-        return first, last
+    """Least and greatest raw code within the DBC's range; limits are often printed rounded, so the outer codes."""
     scale, offset = signal.scale, signal.offset
-    if scale == 0:  # every code means the same value
+    if not _has_range(signal) or scale == 0:
         return first, last
     low, high = signal.minimum, signal.maximum
     if scale < 0:

@@ -1,7 +1,7 @@
 """One open bus: frames in, frames out, frames that the kernel had to drop.
 
-python-can opens every bus.  On SocketCAN we read its socket ourselves, for it can neither count
-overruns (its reader takes one control message a frame) nor send without a select beside each frame.
+python-can opens every bus.  Of SocketCAN we read the socket ourselves: python-can can neither count overruns nor send
+without a select beside each frame.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import select
 import socket
 import struct
 import time
+from collections import deque
 from contextlib import suppress
 from typing import NamedTuple, Protocol
 
@@ -19,15 +20,12 @@ import can
 
 from soilbus.can.publish import Frame
 
-GATHER = 0.005
-"""Pause [s] in which frames gather: the kernel has stamped them, and one waking for several is cheaper."""
+GATHER = 0.005  # pause [s] in which frames gather: the kernel has stamped them, and one waking for several is cheaper
 STAMPED = 0.001
-"""Seconds within which the kernel puts a frame that it has stamped into our socket; a later one counts from the
-next window on."""
+"""Seconds from a frame's stamp until it is in our socket; a later one counts from the next window on."""
 ECHO_TIME, MAX_ECHOES = 1.0, 256
 """Time [s] within which a multicast frame comes back to its sender, and the number that is waited for: ours of 4 s."""
-SMALL_SEND_BUFFER = 1
-"""The kernel makes its least of it, about six frames: no more than these can go stale in a stuck queue."""
+SMALL_SEND_BUFFER = 1  # the kernel's least, about six frames: no more than these can go stale in a stuck queue
 
 _SO_RXQ_OVFL, _SO_TIMESTAMPNS = 40, 35  # asm-generic/socket.h
 _MSG_CONFIRM = 0x800  # the frame is one of this very socket
@@ -57,26 +55,18 @@ class Received(NamedTuple):
 class MessageBus(Protocol):
     """Part of python-can's interface (can.BusABC) that is used."""
 
-    def recv(self, timeout: float | None = None, /) -> Received | can.Message | None:
-        """Return the next frame, or None after `timeout` [s]."""
+    def recv(self, timeout: float | None = None, /) -> Received | can.Message | None: ...
 
-    def send(self, message: can.Message, /) -> None:
-        """Hand one frame to the driver."""
+    def send(self, message: can.Message, /) -> None: ...
 
-    def shutdown(self) -> None:
-        """Close the interface."""
+    def shutdown(self) -> None: ...
 
 
 class MessageWire:
-    """Open bus of any interface of python-can.
+    """Open bus of any interface of python-can; methods raise OSError or can.CanError (ENOBUFS, EAGAIN: no room now)."""
 
-    All methods raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present.
-    """
-
-    overruns = 0
-    """Frames that came and were dropped for want of room since it was opened; 0 where none can tell."""
-    room = math.inf
-    """Bytes of the buffer in which frames wait for us."""
+    overruns = 0  # frames that came and were dropped for want of room since it was opened; 0 where none can tell
+    room = math.inf  # bytes of the buffer in which frames wait for us
 
     def __init__(self, bus: MessageBus) -> None:
         self._bus = bus
@@ -163,31 +153,24 @@ class SocketWire(MessageWire):
 
 
 class MulticastWire(MessageWire):
-    """Multicast group, in which every sent frame comes back to its sender.
-
-    All senders share one port, so the address does not tell whose a frame is. An own frame is known by identifier and
-    data (with our counter in them) within ECHO_TIME of its sending, as often as it was sent.
-    """
+    """Multicast group, in which every sent frame comes back: known by identifier and data within ECHO_TIME."""
 
     def __init__(self, bus: MessageBus) -> None:
         super().__init__(bus)
-        self._echoes: dict[tuple[int, bytes], list[float]] = {}
+        self._echoes: deque[tuple[float, int, bytes]] = deque(maxlen=MAX_ECHOES)
 
     def recv(self, timeout: float) -> Received | can.Message | None:
         message = super().recv(timeout)
-        if message is None or not self._echoes:
-            return message
-        key, oldest = (message.arbitration_id, bytes(message.data)), time.monotonic() - ECHO_TIME
-        expected = [sent for sent in self._echoes.pop(key, []) if sent > oldest]
-        if len(expected) > 1:
-            self._echoes[key] = expected[1:]
-        return None if expected else message
+        while self._echoes and self._echoes[0][0] <= time.monotonic() - ECHO_TIME:
+            self._echoes.popleft()
+        for echo in self._echoes:
+            if message is not None and echo[1:] == (message.arbitration_id, message.data):
+                self._echoes.remove(echo)
+                return None
+        return message
 
     def send(self, frame: Frame) -> None:
-        now = time.monotonic()
-        if len(self._echoes) >= MAX_ECHOES:  # of a group that this host does not hear
-            self._echoes = {key: times for key, times in self._echoes.items() if times[-1] > now - ECHO_TIME}
-        self._echoes.setdefault((frame.arbitration_id, frame.data), []).append(now)
+        self._echoes.append((time.monotonic(), frame.arbitration_id, frame.data))
         super().send(frame)
 
 

@@ -64,10 +64,7 @@ def _from(place: Path, folder: Path, name: str) -> str:
 
 
 def named_from(place: Path, file: Path) -> str:
-    """Return the name by which a configuration in a folder calls a DBC file: ours, or one beside it.
-
-    Raises ConfigError for a name that TOML cannot hold.
-    """
+    """Return the name by which a configuration in a folder calls a DBC file; ConfigError where TOML cannot hold it."""
     is_beside = located(place, file.name).resolve() == file.resolve()
     name = file.name if is_beside else os.path.relpath(file.resolve(), place.resolve())
     try:

@@ -8,22 +8,27 @@ from __future__ import annotations
 
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from soilbus.config.model import Config, Usual
-from soilbus.words import did_you_mean
+from soilbus.words import did_you_mean, shown
 
 OPEN = "?"
 """A value that nobody has filled in yet, as `soilbus init` writes it."""
-MAX_SHOWN_CHARACTERS = 40
-"""Characters of a wrong value that a line repeats."""
+MAX_SHOWN_CHARACTERS = 40  # of a wrong value that a line repeats
 
 
 def fault_lines(raw: Mapping[str, Any], error: ValidationError) -> list[str]:
     """Return one line for each fault: the dotted key, wheels and effects by name, and what is wrong."""
-    return [line for e in error.errors(include_url=False) for line in _lines(raw, e)]
+    lines = []
+    for each in error.errors(include_url=False):
+        where = ".".join(_named(raw, each["loc"]))
+        lines += [f"{where}: {text}" if where else text for text in _text(each).split("\n")]
+    return lines
 
 
 def open_lines(raw: Mapping[str, Any]) -> list[str]:
@@ -41,27 +46,20 @@ def open_lines(raw: Mapping[str, Any]) -> list[str]:
 
 def _wanted(location: Sequence[Any]) -> str:
     """What belongs at a place, in words."""
-    model = _model_at(location[:-1])
-    field = model.model_fields.get(str(location[-1])) if model is not None else None
+    field = _field_at(location)
     if field is None:
         return "its value"
     if choices := _choices(location):
         return f"one of {', '.join(map(str, choices))}"
-    if any(_is_model(kind) and "signal" in kind.model_fields for kind in _parts(field.annotation)):
+    kinds = _parts(field.annotation)
+    if any(_is_model(kind) and "signal" in kind.model_fields for kind in kinds):
         return '"Message.Signal"'
-    if bool in _parts(field.annotation):
+    if bool in kinds:
         return "true or false"
-    known = [m.func for m in field.metadata if isinstance(m, AfterValidator) and isinstance(m.func, Usual)]
-    if known:
-        unit = f" {known[0].unit}" if known[0].unit else ""
-        return f"a number from {known[0].low:g} to {known[0].high:g}{unit}"
-    return "a number" if float in _parts(field.annotation) else "its value"
-
-
-def _lines(raw: Mapping[str, Any], error: Any) -> Iterator[str]:
-    where = ".".join(_named(raw, error["loc"]))
-    for text in _text(error).split("\n"):
-        yield f"{where}: {text}" if where else text
+    for check in (m.func for m in field.metadata if isinstance(m, AfterValidator)):
+        if isinstance(check, Usual):
+            return f"a number from {check.low:g} to {check.high:g} {check.unit}".rstrip()
+    return "a number" if float in kinds else "its value"
 
 
 def _text(error: Any) -> str:
@@ -82,7 +80,7 @@ def _text(error: Any) -> str:
     if kind in ("list_type", "tuple_type"):
         return _list_wanted(error["loc"], given)
     sentence = _SENTENCES.get(kind)
-    return sentence(given, context) if sentence is not None else f"{_shown(given)} cannot be used here"
+    return f"{_shown(given)} cannot be used here" if sentence is None else sentence(given, context)
 
 
 def _unknown_key(location: Sequence[Any]) -> str:
@@ -113,16 +111,11 @@ _OF_MACHINE = ("vehicle", *_REPEATED, "signals")
 
 
 def _number(given: Any, _: Mapping[str, Any]) -> str:
-    hint = f"; write {float(given):g}, without quotes" if isinstance(given, str) and _is_number(given) else ""
+    hint = ""
+    if isinstance(given, str):
+        with suppress(ValueError):
+            hint = f"; write {float(given):g}, without quotes"
     return f"{_shown(given)} is not a number{hint}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 _SENTENCES: Mapping[str, Callable[[Any, Mapping[str, Any]], str]] = {
@@ -146,10 +139,10 @@ _SENTENCES: Mapping[str, Callable[[Any, Mapping[str, Any]], str]] = {
 
 def _table_wanted(location: Sequence[Any], given: Any) -> str:
     model = _model_at(location)
-    keys = ", ".join(model.model_fields) if model is not None else ""
-    if model is not None and "signal" in model.model_fields:
-        return f'{_shown(given)} is not "Message.Signal", nor a table with {keys}'
-    example = f"; write it as a table with any of {keys}" if keys else ""
+    keys = list(model.model_fields) if model is not None else []
+    if "signal" in keys:
+        return f'{_shown(given)} is not "Message.Signal", nor a table with {", ".join(keys)}'
+    example = f"; write it as a table with any of {', '.join(keys)}" if keys else ""
     return f"{_shown(given)} is a single value{example}"
 
 
@@ -167,8 +160,7 @@ def _shown(given: Any) -> str:
         return "a table"
     if isinstance(given, bool):
         return str(given).lower()
-    text = f'"{given}"' if isinstance(given, str) else str(given)
-    return text if len(text) <= MAX_SHOWN_CHARACTERS else text[: MAX_SHOWN_CHARACTERS - 3] + "..."
+    return shown(f'"{given}"' if isinstance(given, str) else given, MAX_SHOWN_CHARACTERS)
 
 
 def _named(raw: Any, location: Sequence[Any]) -> list[str]:
@@ -196,25 +188,24 @@ def _keys(location: Sequence[Any]) -> list[str]:
 
 def _choices(location: Sequence[Any]) -> list[Any]:
     """The values that the key at this location may have."""
+    field = _field_at(location)
+    kinds = [] if field is None else _parts(field.annotation)
+    return [value for kind in kinds if get_origin(kind) is Literal for value in get_args(kind)]
+
+
+def _field_at(location: Sequence[Any]) -> FieldInfo | None:
+    """The field of the key at this location; None where there is no such key."""
     model = _model_at(location[:-1])
-    field = model.model_fields.get(str(location[-1])) if model is not None else None
-    return (
-        []
-        if field is None
-        else [v for kind in _parts(field.annotation) if get_origin(kind) is Literal for v in get_args(kind)]
-    )
+    return None if model is None else model.model_fields.get(str(location[-1]))
 
 
 def _model_at(location: Sequence[Any]) -> type[BaseModel] | None:
     """The model of the table at this location of the configuration."""
-    model: type[BaseModel] | None = Config
-    for part in location:
-        if isinstance(part, int):
-            continue
-        field = model.model_fields.get(part) if model is not None else None
-        found = [] if field is None else [kind for kind in _parts(field.annotation) if _is_model(kind)]
-        model = found[0] if found else None
-    return model
+    names = [part for part in location if not isinstance(part, int)]
+    if not names:
+        return Config
+    field = _field_at(names)
+    return next(filter(_is_model, _parts(field.annotation)), None) if field is not None else None
 
 
 def _parts(kind: Any) -> list[Any]:

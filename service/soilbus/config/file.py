@@ -9,32 +9,21 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from soilbus.config.faults import OPEN, fault_lines, open_lines
+from soilbus.config.faults import fault_lines, open_lines
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 
 __all__ = [
-    "MACHINES",
-    "OPEN",
-    "found_configuration",
-    "load_config",
-    "located",
-    "machine",
-    "overridden",
-    "parse_config",
-    "shipped_dbc",
-]
+    "MACHINES", "found_configuration", "load_config", "located", "machine", "overridden", "parse_config", "shipped_dbc"
+]  # fmt: skip
 
-MAX_FILE_BYTES = 2**20
-"""Bytes of a configuration: a thousand times those of a tractor's."""
-_MAX_SHOWN_CHARACTERS = 60
-"""Characters of an override that a fault repeats."""
+MAX_FILE_BYTES = 2**20  # of a configuration: a thousand times those of a tractor's
+_MAX_SHOWN_CHARACTERS = 60  # of an override that a fault repeats
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 MACHINES = Path(__file__).with_name("machines")
 """Where the configurations of our reference machines are."""
-CONFIGURATION = "soilbus.toml"
-"""The configuration of a folder, for commands that are given none."""
+CONFIGURATION = "soilbus.toml"  # of a folder, for commands that are given none
 DBC_FOLDERS = (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
 """Where our own DBC files are: in the installed package, in a checkout."""
 
@@ -44,8 +33,6 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
 
     Parameters
     ----------
-    path
-        The file.
     overrides
         KEY=VALUE with dotted paths.
 
@@ -75,15 +62,11 @@ def found_configuration(name: str | None) -> Path:
     The name is that of a file, or else of a reference machine; None: `soilbus.toml` in the current folder.
     """
     if name is None:
-        path = Path(CONFIGURATION)
-        if not path.exists():
-            raise ConfigError(
-                [
-                    f"no --config and no {CONFIGURATION} here: soilbus init --dbc YOUR.dbc -o {CONFIGURATION} makes"
-                    " one; --config tractor is the simulated tractor's"
-                ]
-            )
-        return path
+        if not Path(CONFIGURATION).exists():
+            makes = f"soilbus init --dbc YOUR.dbc -o {CONFIGURATION} makes one"
+            other = "--config tractor is the simulated tractor's"
+            raise ConfigError([f"no --config and no {CONFIGURATION} here: {makes}; {other}"])
+        return Path(CONFIGURATION)
     path = Path(name)
     if path.exists() or "/" in name or path.suffix:
         return path
@@ -161,10 +144,7 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
 
 
 def shipped_dbc(name: str) -> Path:
-    """Return the path of a DBC file that comes with soilbus: in a checkout's dbc/ or the installed package.
-
-    Raises FileNotFoundError when there is none of that name.
-    """
+    """Return the path of a DBC file that comes with soilbus; FileNotFoundError when there is none of that name."""
     if name and Path(name).name == name:
         for folder in DBC_FOLDERS:
             if (folder / name).is_file():

@@ -32,33 +32,10 @@ from soilbus.grouping import grouped
 from soilbus.words import LONGEST_NAME, did_you_mean, shown
 
 __all__ = [
-    "J1939",
-    "Axle",
-    "Bus",
-    "Column",
-    "Columns",
-    "Config",
-    "ConfigError",
-    "Dbc",
-    "Effect",
-    "Estimator",
-    "Form",
-    "Model",
-    "Noise",
-    "NoiseOfChannels",
-    "Output",
-    "Prior",
-    "RunningGear",
-    "Signal",
-    "Signals",
-    "SoilPrior",
-    "Table",
-    "Track",
-    "Traversability",
-    "Vehicle",
-    "Warning",
-    "Wheel",
-]
+    "J1939", "Axle", "Bus", "Column", "Columns", "Config", "ConfigError", "Dbc", "Effect", "Estimator", "Form", "Model",
+    "Noise", "NoiseOfChannels", "Output", "Prior", "RunningGear", "Signal", "Signals", "SoilPrior", "Table", "Track",
+    "Traversability", "Vehicle", "Warning", "Wheel",
+]  # fmt: skip
 
 SHORT_BIN = 0.04
 """Length of a bin [s] in which a wheel's slip hardly changes while its load shakes at 1.5 to 3 Hz; evidence at
@@ -205,13 +182,9 @@ class Signal(_Section):
     """Unit of a column's values, where its name does not end in one."""
 
     @model_validator(mode="after")
-    def _unsprung_beside_springs(self) -> Signal:
+    def _of_one_kind(self) -> Signal:
         if self.unsprung_mass and self.effective_area is None:
             raise ValueError("unsprung_mass is for the pressure of air springs: give their effective_area, too")
-        return self
-
-    @model_validator(mode="after")
-    def _one_way_to_torque(self) -> Signal:
         if self.torque_constant is not None and self.reference_torque is not None:
             raise ValueError(
                 "torque_constant is for a current, reference_torque for a percentage: leave out one of the two"
@@ -261,17 +234,14 @@ class Vehicle(_Section):
             return value
         out = dict(value)
         for key, std in (("mass", "mass_std"), ("cg_ahead_of_rear_axle", "cg_std")):
-            given = out.get(key)
-            if isinstance(given, Mapping):
-                if unknown := [k for k in given if k not in ("value", "std")]:
-                    raise ValueError(f"{key}: unknown key {unknown[0]}; it is a number or {{ value, std }}")
-                out |= {key: given["value"]} if "value" in given else {}
-                if "value" not in given:
-                    del out[key]
-                if "std" in given and std in out:
-                    raise ValueError(f"{key} = {{ value, std }} and {std} are the same: leave out one of the two")
-                if "std" in given:
-                    out[std] = given["std"]
+            if not isinstance(given := out.get(key), Mapping):
+                continue
+            if unknown := [k for k in given if k not in ("value", "std")]:
+                raise ValueError(f"{key}: unknown key {unknown[0]}; it is a number or {{ value, std }}")
+            if "std" in given and std in out:
+                raise ValueError(f"{key} = {{ value, std }} and {std} are the same: leave out one of the two")
+            del out[key]
+            out |= {{"value": key, "std": std}[part]: number for part, number in given.items()}
         return out
 
     @model_validator(mode="after")
@@ -612,11 +582,11 @@ class NoiseOfChannels(_Section):
 
     def scaled(self, factor: float, *parts: str) -> NoiseOfChannels:
         """Return the noise with these parts (by default all) of each channel times a factor, which may be 0."""
-        noises = {name: getattr(self, name) for name in type(self).model_fields}
-        return self.model_copy(update={
-            name: noise.model_copy(update={part: factor * getattr(noise, part) for part in parts or Noise.model_fields})
-            for name, noise in noises.items()
-        })  # fmt: skip
+        scaled = {}
+        for name, noise in self:
+            sizes = {part: factor * size for part, size in noise if part in parts or not parts}
+            scaled[name] = noise.model_copy(update=sizes)
+        return self.model_copy(update=scaled)
 
 
 class Prior(_Section):
@@ -954,25 +924,16 @@ class Config(_Section):
     def _one_axle_of_a_name(cls, value: Any) -> Any:
         """[[axle]]s of one name that share no other key as one: a motor, and a load cell that stands apart."""
         axles = value.get("axle") if isinstance(value, Mapping) else None
-        if not isinstance(axles, list):
+        if not isinstance(axles, list) or not all(isinstance(axle, Mapping) for axle in axles):
             return value
-        merged: list[Any] = []
+        merged: list[Mapping[str, Any]] = []
         for axle in axles:
-            known = next(
-                (
-                    a
-                    for a in merged
-                    if isinstance(a, Mapping)
-                    and isinstance(axle, Mapping)
-                    and a.get("name") == axle.get("name")
-                    and a.keys() & axle.keys() == {"name"}
-                ),
-                None,
-            )
-            if known is None:
-                merged.append(axle)
+            for i, known in enumerate(merged):
+                if known.get("name") == axle.get("name") and known.keys() & axle.keys() == {"name"}:
+                    merged[i] = {**known, **axle}
+                    break
             else:
-                merged[merged.index(known)] = {**known, **axle}
+                merged.append(axle)
         return {**value, "axle": merged}
 
     @model_validator(mode="after")
@@ -981,9 +942,7 @@ class Config(_Section):
         if self.track and (self.wheel or len(self.track) == 1) and any(t.axle is None for t in self.track):
             raise ValueError("a [[track]] beside [[wheel]]s, or alone, needs its axle")
         if len({t.rollers for t in self.track}) > 1:
-            raise ValueError(
-                "the [[track]]s of a vehicle need the same number of rollers: contact_length / roller_spacing"
-            )
+            raise ValueError("[[track]]s of a vehicle need the same number of rollers: contact_length / roller_spacing")
         if len({t.axle is None for t in self.track}) > 1:
             raise ValueError("give the axle of all [[track]]s or, where they carry the whole vehicle, of none")
         object.__setattr__(self, "wheel", [*self.wheel, *(t.as_wheel() for t in self.track)])

@@ -22,7 +22,7 @@ from soilbus.can.mapping import DIMENSIONS, VEHICLE_ROLES
 from soilbus.can.role_matching import AXLES, ONLY, WHEELS, Assignment, Candidate, Slot, axles_of, described, is_word_in
 from soilbus.can.validity import vouching_codes
 from soilbus.config.edit import toml_text
-from soilbus.config.file import OPEN
+from soilbus.config.faults import OPEN
 from soilbus.grouping import grouped
 from soilbus.sensors.role_evidence import Facts
 from soilbus.words import shown
