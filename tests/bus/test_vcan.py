@@ -24,6 +24,8 @@ import pytest
 from cantools.database.can import Database, Signal
 from numpy.typing import NDArray
 
+from soilbus.can.checksum import frame_checksum
+
 REPO = Path(__file__).resolve().parents[2]
 CONFIG = REPO / "tests/field/field.toml"
 LIVE = Path(__file__).with_name("live.py")
@@ -213,7 +215,7 @@ def test_counters_and_checksums_hold(live: Run) -> None:
         counters = [frame.values["Counter"] for frame in frames]
         assert {(b - a) % 16 for a, b in itertools.pairwise(counters)} <= {1}, name
         for frame in frames:
-            assert frame.data[7] == _crc8(frame.arbitration_id.to_bytes(4, "little") + frame.data[:7]), name
+            assert frame.data[7] == frame_checksum(frame.arbitration_id, frame.data, 7), name
 
 
 def _sibling(live: Run, message: str, soil: Frame) -> Frame:
@@ -235,13 +237,3 @@ def _same(signal: Signal, frame: Frame, told: float | None) -> bool:
     if told is None or not signal.minimum <= told / factor <= signal.maximum:
         return got >= signal.maximum
     return abs(got - told / factor) <= signal.scale
-
-
-def _crc8(data: bytes) -> int:
-    """SAE J1850, bit by bit."""
-    crc = 0xFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x1D if crc & 0x80 else 0)) & 0xFF
-    return crc ^ 0xFF

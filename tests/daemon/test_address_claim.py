@@ -9,7 +9,7 @@ import can
 import pytest
 from j1939 import ControllerApplication, ElectronicControlUnit, Name
 
-from fakes import Bench, drive_messages
+from fakes import Bench, Notes, drive_messages
 from soilbus.can.dbc_files import output_database
 from soilbus.can.j1939 import name_of
 from soilbus.config.model import J1939, ConfigError
@@ -118,16 +118,6 @@ def test_an_echo_of_our_own_claim_is_no_contender(ours):
     assert ours.claim.holds
 
 
-class Notifier:
-    watchdog_interval = None
-
-    def __init__(self) -> None:
-        self.said = ""
-
-    def status(self, text: str) -> None:
-        self.said = text
-
-
 def wait_until_held(claim: AddressClaim) -> None:
     """Let the time pass in which a claim may be contested, which is can-j1939's own."""
     end = time.monotonic() + PATIENCE
@@ -147,7 +137,7 @@ def test_the_service_sends_nothing_of_its_own_before_the_claim_nor_after_its_los
     lost_at = messages[0].timestamp + 1.5
     rival = name_of(OURS.model_copy(update={"identity_number": 1})).to_bytes(8, "little")
     contest = can.Message(timestamp=lost_at, arbitration_id=CLAIM, data=rival)
-    claim, notifier = AddressClaim(OURS, ADDRESS), Notifier()
+    claim, notifier = AddressClaim(OURS, ADDRESS), Notes()
     bench = Bench(sorted([*messages, contest], key=lambda m: m.timestamp), claim=claim, notifier=notifier)
     bench.run(0.5)
     assert of_ours(bench) == []

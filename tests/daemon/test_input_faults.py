@@ -242,7 +242,6 @@ FAULTS = {
     "sinkage out of reason": Fault(le.codes(0x7FF0, SINKS[0]), GOOD, "none", "implausible"),
     # stammering senders
     "duplicated": Fault(le.duplicated, GOOD, "none", "duplicate"),
-    "reordered": Fault(le.reordered, GOOD, "none"),
 }  # fmt: skip
 
 
@@ -254,13 +253,6 @@ def test_a_fault_has_its_status_its_reason_and_no_wrong_valid_window(name, loam)
 OURS = {
     "nothing": Fault(le.both(), GOOD, "none"),
     "draft's counter stuck": Fault(le.stalled("DrawbarPin"), BAD, "input_stale draft", "bad_counter"),
-    "another node sends the draft, too": Fault(
-        le.joined_by("DrawbarPin", 10), BAD, "input_rejected draft (second_sender)", "second_sender bad_counter"
-    ),
-    "motor's checksum wrong": Fault(le.broken_checksums("MotorRL"), BAD, "input_stale torque.RL", "bad_checksum"),
-    "attitude's checksum wrong": Fault(
-        le.broken_checksums("Attitude"), BAD, "input_stale pitch acceleration", "bad_checksum"
-    ),
     "draft frozen with running counter": Fault(le.frozen("DrawbarPin.Draft"), BAD, lies("draft")),
     "torque limit lost": Fault(le.codes(0xFFFF, "MotorFL.TorqueLimit"), GOOD, "none", "not_available"),
     "motor speed of another gear": Fault(le.scaled(0.75, "MotorFR.ShaftSpeed"), GOOD, lies("motor_speed.FR")),

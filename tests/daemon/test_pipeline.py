@@ -24,7 +24,7 @@ CLAY = ["soil.c.value=5000", "soil.c.std=1250", "soil.K.value=0.01", "soil.K.std
 STUBBLE = ["soil.c.value=3000", "soil.c.std=750"]
 START = 1_700_000_000.0
 
-SPEEDS, LOADS, DRAWBAR, SINKAGES, ATTITUDE = 0x510, 0x520, 0x530, 0x540, 0x550
+LOADS, DRAWBAR, SINKAGES = 0x520, 0x530, 0x540
 MCU_RR = 0x18FF2213
 RADAR = 0x18FE4997
 
@@ -173,78 +173,18 @@ def test_stubble_scatters_more_than_its_sensors_and_what_comes_is_predicted(whol
             assert max(later.slip.values()) < largest
 
 
-KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-OF_DECISION = {"state", "reason", "capability", "warning"}
-MORE = OF_DECISION | {
-    "solver",
-    "search_ended",
-    "window",
-    "log",
-    "soil_class",
-    "soil_change",
-    "gaps",
-    "prediction_error",
-    "standing",
-    "noise_factors",
-}
-CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
-DECISION = {
-    "contradicted",
-    "state",
-    "probability",
-    "torque_required",
-    "torque_available",
-    "max_draft",
-    "max_grade",
-    "limit",
-    "age",
-    "since_valid",
-}
-
-
 @pytest.mark.parametrize("name", ["loam", "clay", "stubble"])
-def test_json_lines_have_the_keys_of_the_design(name, whole):
+def test_json_lines_are_strict_and_number_the_windows(name, whole):
+    """Their keys are those of the page (test_json_table.py) and of the golden outputs."""
     results, pipeline = whole(name)
-    assert "none" in {str(r.watch.warning) for r in results} or name == "stubble"  # no valid window
-
-    def no_constant(text: str) -> None:
-        raise AssertionError(f"{text} is not JSON")
-
-    numbers = []
-    for r in results:
-        line = json_line(r, pipeline.config)
-        assert "\n" not in line
-        one = json.loads(line, parse_constant=no_constant)
-        assert set(one) - MORE == KEYS
-        assert set(one["traversability"]) == DECISION
-        assert one["warning"]["state"] in ("unknown", "none", "immobilisation")
-        assert set(one["warning"]) == {"state", "time_left", "since", "begun"}
-        if one["soil"] is not None:
-            able = one["capability"]
-            assert set(able) == CAPABILITY
-            assert set(able["set_points"]) == {"front", "rear"}
-            assert set(able["set_points"]["rear"]) == {"efficiency", "pull"}
-            assert {len(column) for column in able["over_slip"].values()} == {9}
-            forecast = able["forecast"]
-            assert (forecast is None) == (one["traversability"]["torque_required"] is None)
-            if forecast is not None:
-                assert set(forecast["sinkage"]) == {"FL", "FR", "RL", "RR"}
-                assert forecast["torque"]["value"] == one["traversability"]["torque_required"]
-        else:
-            assert one["capability"] is None
-        assert set(one["bearing_pressure"]) == {"z_ref", "b_ref", "value", "std", "z_driven", "extrapolates"}
-        assert one["soil"] is None or {k: set(v) for k, v in one["soil"].items()} == {
-            k: {"value", "std"} for k in ("k_c", "k_phi", "n", "phi", "c", "K")
-        }
-        assert (one["soil_class"] is None) == (one["soil"] is None)
-        assert one["soil_class"] is None or (len(one["soil_class"]) == 4 and "unknown" in one["soil_class"])
-        assert set(one["slip"]) == set(one["sinkage"]) == {"FL", "FR", "RL", "RR"}
-        assert one["status"] in ("valid", "degraded", "not_excited", "invalid")
-        assert one["traversability"]["state"] in ("go", "caution", "no_go", "unknown")
-        assert (one["soil"] is None) == (one["status"] == "invalid")
-        numbers.append(one["window"])
-    assert numbers == list(range(len(results)))
-    assert np.diff([r.t for r in results]) == pytest.approx(np.ones(len(results) - 1))
+    lines = [json_line(r, pipeline.config) for r in results]
+    assert not any("\n" in line for line in lines)
+    found = [json.loads(line, parse_constant=pytest.fail) for line in lines]
+    assert [one["window"] for one in found] == list(range(len(results)))
+    assert np.diff([one["t"] for one in found]) == pytest.approx(np.ones(len(found) - 1))
+    for one in found:
+        nothing = one["status"] == "invalid"
+        assert nothing is (one["soil"] is None) is (one["capability"] is None) is (one["soil_class"] is None)
 
 
 def same(results, expected, config) -> bool:
@@ -256,13 +196,6 @@ def same(results, expected, config) -> bool:
         for key, value in one.items():
             assert value == (pytest.approx(other[key], rel=1e-7) if isinstance(value, float) else other[key]), key
     return True
-
-
-@pytest.mark.parametrize("every", [1, 100_000])
-def test_windows_do_not_depend_on_when_the_clock_is_looked_at(every, recording, whole):
-    frames = [f for f in recording("clay") if f[0] < START + 14.0]
-    pipeline = new_pipeline(*CLAY)
-    assert same(run(frames, every=every, pipeline=pipeline)[:4], whole("clay")[0][:4], pipeline.config)
 
 
 @settings(max_examples=4)

@@ -128,22 +128,6 @@ def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
     assert not coverage(store.window(0.0, bin_length), 0.5).any()
 
 
-def test_an_estimator_beside_gives_the_same_results(tmp_path):
-    config = reference_configuration()
-    log = tmp_path / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 14.0), seed=4), config), log)
-
-    def results(workers):
-        return [repr(r) for r in replay(Pipeline(config, load_databases(config)), [log], workers=workers)]
-
-    with estimator_beside(config) as workers:
-        assert workers is not None
-        beside = results(workers)
-    assert any("warning=<Alert.NONE" in result for result in beside)  # watched, in replay too
-    assert len(beside) == 4
-    assert beside == results(None)
-
-
 def test_windows_before_a_cut_come_before_its_error_with_an_estimator_beside(tmp_path):
     config = reference_configuration()
     log = tmp_path / "drive.log"

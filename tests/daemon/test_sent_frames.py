@@ -14,6 +14,7 @@ import can
 import pytest
 
 from fakes import drive_messages
+from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -27,16 +28,6 @@ from soilbus.simulator.reference import TRACTOR, reference_configuration
 DURATION = 16.0
 DATABASE = output_database(reference_configuration())
 Decoded = tuple[float, dict[str, object]]
-
-
-def crc_of(message: can.Message) -> int:
-    """The README's checksum, a bit at a time."""
-    crc = 0xFF
-    for byte in message.arbitration_id.to_bytes(4, "little") + bytes(message.data[:7]):
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
-    return crc ^ 0xFF
 
 
 def by_name(messages: list[can.Message]) -> dict[str, list[Decoded]]:
@@ -66,7 +57,7 @@ def sent(place) -> list[can.Message]:
 def test_every_frame_decodes_with_the_right_checksum_and_counter(sent):
     counters: dict[int, list[int]] = defaultdict(list)
     for message in sent:
-        assert message.data[7] == crc_of(message)
+        assert message.data[7] == frame_checksum(message.arbitration_id, bytes(message.data), 7)
         counters[message.arbitration_id].append(message.data[6] >> 4)
     assert len(counters) == len(DATABASE.messages) - 2  # a vehicle of four wheels has no second four
     for counter in counters.values():

@@ -25,7 +25,9 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
-__all__ = ["Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "ScriptedBus", "drive_messages", "feed_message"]
+__all__ = [
+    "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "feed_message",
+]  # fmt: skip
 
 FakeClock = PlayedClock
 
@@ -40,6 +42,15 @@ def feed_message(admission: Admission, message: can.Message) -> None:
     admission.feed(
         message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
     )
+
+
+class Notes(Notifier):
+    """The notifier's place: what the status was last."""
+
+    said = ""
+
+    def status(self, text: str) -> None:
+        self.said = text
 
 
 class HeldExecutor(InlineExecutor):

@@ -1,7 +1,7 @@
-"""Drives that end stuck or lack a motor, frame by frame, by other formulas than the simulator's.
+"""Drives that end stuck or lack a motor, frame by frame.
 
-While it drives, the simulator's quasi-static tractor; from then on kinematics and statics written down here: the ground
-speed, and the rim speed and torque of each wheel.
+While it drives, the simulator's quasi-static tractor; where it stands, starts or lacks torque, kinematics and statics
+written down here: the ground speed, and the rim speed and torque of each wheel.
 """
 
 from __future__ import annotations
@@ -12,21 +12,22 @@ from typing import NamedTuple
 
 import can
 import numpy as np
-from scipy.optimize import brentq
 
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import chassis_of, rig_of
 from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
-from soilbus.simulator.scenario import SAMPLE_RATE, Patch, Profile, Scenario
+from soilbus.simulator.scenario import SAMPLE_RATE, Patch, Profile, Scenario, Swing
 from soilbus.simulator.sensors import measure
+from soilbus.terra.effects.effect import Active, Effect, Surroundings
+from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY, axle_loads
-from soilbus.terra.wheel import Soil
+from soilbus.terra.wheel import Soil, WheelModel, WheelState
 from soilbus.trials.boggings import largest_draft
 from soilbus.trials.windows import torque_limits
-from statics import WEIGHT, brute_with_rolling, wheel
+from statics import WEIGHT, wheel
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
@@ -194,62 +195,47 @@ def turned_onto(config: Config, soil: str, seed: int, lasts: float = 8.0) -> Sto
 
 
 def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: float = 15.0) -> tuple[Story, float]:
-    """The motors of one axle give nothing though their limit says otherwise, and the most that is then pulled [N].
-
-    Balanced by brute force, over slips of the other axle that swing between 0.15 and 0.5.
-    """
-    slips = np.array([0.12, 0.18, 0.27, 0.4, 0.6])
-    found = [brute_with_rolling(SOILS[soil], slip, dead) for slip in slips]
-    pulls = np.array([pull for pull, _ in found])
-    rng = np.random.default_rng([seed, 3])
-    done = driven(config, seed, 3.0, None)
-    t = np.arange(0.0, seconds, 1.0 / SAMPLE_RATE)
-    phase = rng.uniform(0.0, 6.0, 2)
-    slip = 0.325 + 0.0875 * (np.sin(0.7 * t + phase[0]) + np.sin(1.1 * t + phase[1]))
-    columns = {"t": t, "ground_speed": 1.3 + 0.0 * t, "acceleration": 0.0 * t, "pitch": 0.0 * t}
-    columns["draft"] = np.interp(slip, slips, pulls)
-    for w in config.wheel:
-        load, _, torque, angle, s = np.array([axles[str(w.axle)] for _, axles in found]).T
-        of_wheel = {"load": load, "torque": torque, "sinkage": w.radius * (1.0 - np.cos(angle))}
-        columns |= {f"{quantity}.{w.name}": np.interp(slip, slips, column) for quantity, column in of_wheel.items()}
-        columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - np.interp(slip, slips, s)))
-    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
-    return told(replace(done, columns=rest | columns), config, seed, 0.0), float(pulls.max())
+    """The motors of one axle give nothing though their limit says otherwise, and the most that is then pulled [N]."""
+    wheels = [w.model_copy(update={"driven": w.axle != dead}) for w in config.wheel]
+    truth = config.model_copy(update={"wheel": wheels})
+    scenario = Scenario(seconds, [Patch(0.0, soil)], Swing(1.3, 1.3), slip=Swing(0.15, 0.5), slip_spread=0.0)
+    done = with_full_limits(drive(truth, scenario, seed), config)
+    return told(done, config, seed, 0.0), largest_draft(truth, soil)
 
 
 def with_a_soft_side(config: Config, soft: str, seed: int, over: float = 3.0) -> tuple[Story, float, float]:
     """From loam, with the left wheels onto a softer soil within so many seconds, under a draft that is held.
 
-    By brute force, all wheels at one slip.  Second and third the most that is pulled afterwards [N], and the draft [N].
+    Second and third the most that is pulled afterwards [N], and the draft [N].
     """
+    begins, left = 14.0, np.array([w.name.endswith("L") for w in config.wheel])
     firm, other = (np.log(np.array(SOILS[name])) for name in ("loam", soft))
-    shares, slips = np.linspace(0.0, 1.0, 4), np.array([0.03, 0.07, 0.13, 0.22, 0.36, 0.6])
-    table = [[_half_on(Soil(*np.exp(firm + share * (other - firm))), slip) for slip in slips] for share in shares]
-    pulls = np.array([[pull for pull, _ in row] for row in table])
-    begins, most = 14.0, float(pulls[-1].max())
+
+    def softer(since: float) -> Active:
+        def act(state: WheelState, model: WheelModel, around: Surroundings, _: object) -> tuple[WheelState, WheelModel]:
+            share = left * np.clip((around.t - since) / over, 0.0, 1.0)
+            soil = Soil(*(np.exp(a + share * (b - a)) for a, b in zip(firm, other, strict=True)))
+            K_L = lumped_modulus(soil.k_c, soil.k_phi, state.width)
+            return state._replace(K_L=K_L, n=soil.n, tan_phi=np.tan(soil.phi), c=soil.c, K=soil.K), model
+
+        return Active(Effect("softer", "", "", "", (), wheel=act), {})
+
+    even = Scenario(
+        0.1, [Patch(0.0, "loam")], Swing(1.3, 1.3), slip=Swing(0.6, 0.6), slip_spread=0.0, side_shift=Swing(0.0, 0.0)
+    )
+    pulled = (
+        drive(config, replace(even, slip=Swing(slip, slip)), seed, [softer(-over)]).columns["draft"]
+        for slip in (0.2, 0.3, 0.45, 0.6)
+    )
+    most = max(float(draft[-1]) for draft in pulled)
     rng = np.random.default_rng([seed, 5])
-    t = np.arange(0.0, begins + over + 3.0, 1.0 / SAMPLE_RATE)
     held = most * rng.uniform(0.90, 0.97)
+    t = np.arange(0.0, begins + over + 3.0, 0.25)
     swing = held * (1.0 - 0.45 * (1.0 + np.sin(0.8 * t + rng.uniform(0.0, 6.0))) * np.clip(begins - t, 0.0, 1.0))
-    share = np.clip((t - begins) / over, 0.0, 1.0)
-    columns = {"t": t, "ground_speed": 1.3 + 0.0 * t, "acceleration": 0.0 * t, "pitch": 0.0 * t, "draft": swing}
-
-    def along(values: np.ndarray) -> np.ndarray:
-        """Values (share, slip) at each instant's share, over slip."""
-        return np.array([[np.interp(s, shares, column) for column in values.T] for s in share])
-
-    slip = np.array([np.interp(p, row, slips) for p, row in zip(swing, along(pulls), strict=True)])
-    for i, w in enumerate(config.wheel):
-        quantities = {q: np.array([[of[i][q] for _, of in row] for row in table]) for q in table[0][0][1][i]}
-        for q, values in quantities.items():
-            of_time = along(values)
-            columns[f"{q}.{w.name}"] = np.array(
-                [np.interp(s, slips, row) for s, row in zip(slip, of_time, strict=True)]
-            )
-        columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - slip))
-    done = driven(config, seed, 3.0, None)
-    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
-    return told(replace(done, columns=rest | columns), config, seed, begins), most, held
+    draft = Profile(t.tolist(), swing.tolist())
+    scenario = replace(even, duration=float(t[-1]), slip=None, draft=draft)
+    done = drive(config, scenario, seed, [softer(begins)])
+    return told(done, config, seed, begins), most, held
 
 
 def with_weak_motors(
@@ -334,18 +320,7 @@ def _over_load_and_slip(soil: Soil, radius: float, width: float) -> np.ndarray:
     )
 
 
-def _half_on(left: Soil, slip: float) -> tuple[float, list[dict[str, float]]]:
-    """Level pull [N] with left wheels on a soil and right ones on loam, and each wheel's load, torque, sinkage."""
-    sizes = ((0.50, 0.26), (0.50, 0.26), (0.62, 0.38), (0.62, 0.38))
-
-    def wheels(pull: float) -> list[np.ndarray]:
-        front = (WEIGHT * 0.95 - pull * 0.45) / 1.95
-        loads = (front / 2.0, front / 2.0, (WEIGHT - front) / 2.0, (WEIGHT - front) / 2.0)
-        soils = (left, SOILS["loam"], left, SOILS["loam"])
-        return [wheel(*each, slip, *size) for each, size in zip(zip(soils, loads, strict=True), sizes, strict=True)]
-
-    pull = float(brentq(lambda p: sum(w[1] for w in wheels(p)) - p, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1.0))
-    return pull, [
-        {"load": w[0], "torque": w[2], "sinkage": size[0] * (1.0 - np.cos(w[3]))}
-        for w, size in zip(wheels(pull), sizes, strict=True)
-    ]
+def with_full_limits(done: Drive, config: Config) -> Drive:
+    """The drive with motors that all report the limit that the configuration has."""
+    limits = {f"torque_limit.{w.name}": np.full(len(done.columns["t"]), w.max_torque) for w in config.wheel}
+    return replace(done, columns=done.columns | limits)

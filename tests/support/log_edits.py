@@ -117,113 +117,76 @@ Edit = Callable[[Log, float], Log]
 """Of a log, from a time [s] on."""
 
 
-def split(path: str) -> tuple[str, str]:
-    message, _, signal = path.partition(".")
-    return message, signal
-
-
-def cut(message: str) -> Edit:
-    """Nothing follows."""
-    return lambda log, t: log.changed(message, lambda s: s.before(t) if (s.t < t).any() else None)
-
-
-def _edited(edit: Callable[[Stream, str], Stream], signal: str) -> Callable[[Stream], Stream]:
-    return lambda stream: edit(stream, signal)
-
-
-def mapped(*paths: str, by: Callable[[Array], Array]) -> Edit:
-    """Values (N,) of signals replaced by a function of them."""
+def each(paths: Iterable[str], change: Callable[[Stream, str, float], Stream | None]) -> Edit:
+    """The change of the streams of these messages, or of these signals MESSAGE.SIGNAL, one after the other."""
 
     def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
-            log = log.changed(message, _edited(lambda s, n: s.with_values(n, by(s.signal(n)), s.t >= t), signal))
+        for message, _, signal in (path.partition(".") for path in paths):
+            log = log.changed(message, lambda s, name=signal: change(s, name, t))  # type: ignore[misc]
         return log
 
     return edit
 
 
+def last_before(s: Stream, t: float) -> int:
+    """Index of the last frame before t [s], else the first."""
+    return max(int(np.sum(s.t < t)) - 1, 0)
+
+
+def cut(message: str) -> Edit:
+    """Nothing follows."""
+    return each([message], lambda s, _, t: s.before(t) if (s.t < t).any() else None)
+
+
 def flipped(*paths: str) -> Edit:
     """The other sign."""
-    return mapped(*paths, by=np.negative)
+    return scaled(-1.0, *paths)
 
 
 def scaled(factor: float, *paths: str) -> Edit:
     """A wrong factor."""
-    return mapped(*paths, by=lambda values: factor * values)
+    return each(paths, lambda s, name, t: s.with_values(name, factor * s.signal(name), s.t >= t))
 
 
 def offset(by: float, *paths: str) -> Edit:
     """A lost zero."""
-    return mapped(*paths, by=lambda values: values + by)
+    return spiked(by, 1, *paths)
+
+
+def spiked(by: float, every: int, *paths: str) -> Edit:
+    """Every so many samples one stands out by so much."""
+    return each(
+        paths,
+        lambda s, name, t: s.with_values(name, s.signal(name) + by, (s.t >= t) & (np.arange(len(s.t)) % every == 0)),
+    )
+
+
+def codes(code: int, *paths: str) -> Edit:
+    """A code that means no value."""
+    return each(paths, lambda s, name, t: s.with_codes(name, np.full(len(s.t), code), s.t >= t))
 
 
 def frozen(*paths: str) -> Edit:
     """The signals repeat their last good value; the rest of the frame goes on."""
 
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
+    def stuck(s: Stream, name: str, t: float) -> Stream:
+        return s.with_codes(name, np.full(len(s.t), s.raw(name)[last_before(s, t)]), s.t >= t)
 
-            def stuck(s: Stream, n: str = signal) -> Stream:
-                code = s.raw(n)
-                return s.with_codes(n, np.full(len(code), code[max(int(np.sum(s.t < t)) - 1, 0)]), s.t >= t)
-
-            log = log.changed(message, stuck)
-        return log
-
-    return edit
+    return each(paths, stuck)
 
 
 def stalled(message: str) -> Edit:
     """The whole frame is repeated, counter and checksum with it."""
 
-    def edit(s: Stream, t: float) -> Stream:
-        payload = s.payload.copy()
-        payload[s.t >= t] = payload[max(int(np.sum(s.t < t)) - 1, 0)]
-        return s.with_payload(payload)
+    def stuck(s: Stream, _: str, t: float) -> Stream:
+        return s.with_payload(np.where((s.t >= t)[:, None], s.payload[last_before(s, t)], s.payload))
 
-    return lambda log, t: log.changed(message, lambda s: edit(s, t))
-
-
-def spiked(by: float, every: int, *paths: str) -> Edit:
-    """Every so many samples one stands out by so much."""
-
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
-
-            def spikes(s: Stream, n: str = signal) -> Stream:
-                hit = (s.t >= t) & (np.arange(len(s.t)) % every == 0)
-                return s.with_values(n, s.signal(n) + by, hit)
-
-            log = log.changed(message, spikes)
-        return log
-
-    return edit
-
-
-def codes(code: int, *paths: str) -> Edit:
-    """A code that means no value."""
-
-    def edit(log: Log, t: float) -> Log:
-        for path in paths:
-            message, signal = split(path)
-            log = log.changed(message, _edited(lambda s, n: s.with_codes(n, np.full(len(s.t), code), s.t >= t), signal))
-        return log
-
-    return edit
+    return each([message], stuck)
 
 
 def delayed(by: float, *messages: str) -> Edit:
     """Frames come, and are stamped, so much later [s]."""
-
-    def edit(log: Log, t: float) -> Log:
-        for message in messages:
-            log = log.changed(message, lambda s: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))
-        return log
-
-    return edit
+    return each(messages, lambda s, _, t: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))
 
 
 class Restamped(Log):
@@ -235,11 +198,10 @@ class Restamped(Log):
 
     def frames(self) -> list[Frame]:
         """As they come."""
-
-        def stamped(t: float, i: int, extended: bool, data: bytes) -> Frame:
-            return t - self.by if i in self.ids and t >= self.since else t, i, extended, data
-
-        return [stamped(*frame) for frame in super().frames()]
+        return [
+            (t - self.by if i in self.ids and t >= self.since else t, i, extended, data)
+            for t, i, extended, data in super().frames()
+        ]
 
 
 def stamped_early(by: float, *messages: str) -> Edit:
@@ -251,24 +213,11 @@ def swapped(a: str, b: str) -> Edit:
     """Two signals of the same layout exchanged (both messages at the same rate, as their frames come)."""
 
     def edit(log: Log, t: float) -> Log:
-        (ma, sa), (mb, sb) = split(a), split(b)
-        one, other = log.streams[ma], log.streams[mb]
-        va, vb = one.signal(sa), other.signal(sb)
-        of_b = np.interp(one.t, other.t, vb)
-        of_a = np.interp(other.t, one.t, va)
-        log = log.changed(ma, lambda s: s.with_values(sa, of_b, s.t >= t))
-        return log.changed(mb, lambda s: s.with_values(sb, of_a, s.t >= t))
-
-    return edit
-
-
-def every_frame(change: Callable[[Stream, float], Stream]) -> Edit:
-    """The same edit of all streams."""
-
-    def edit(log: Log, t: float) -> Log:
-        for name in log.streams:
-            log = log.changed(name, lambda s: change(s, t))
-        return log
+        (one, of_a), (other, of_b) = ((log.streams[m], s) for m, _, s in (path.partition(".") for path in (a, b)))
+        from_b = np.interp(one.t, other.t, other.signal(of_b))
+        from_a = np.interp(other.t, one.t, one.signal(of_a))
+        log = each([a], lambda s, name, t: s.with_values(name, from_b, s.t >= t))(log, t)
+        return each([b], lambda s, name, t: s.with_values(name, from_a, s.t >= t))(log, t)
 
     return edit
 
@@ -276,61 +225,21 @@ def every_frame(change: Callable[[Stream, float], Stream]) -> Edit:
 def duplicated(log: Log, t: float) -> Log:
     """Each frame comes twice, 0.2 ms apart."""
 
-    def twice(s: Stream, t: float) -> Stream:
+    def twice(s: Stream, _: str, t: float) -> Stream:
         late = s.t >= t
         stamps = np.concatenate([s.t, s.t[late] + 2e-4])
         order = np.argsort(stamps, kind="stable")
         return Stream(s.message, stamps[order], np.concatenate([s.payload, s.payload[late]])[order])
 
-    return every_frame(twice)(log, t)
-
-
-def reordered(log: Log, t: float) -> Log:
-    """Each second frame changes places with the one before: the payloads come in the wrong order."""
-
-    def exchange(s: Stream, t: float) -> Stream:
-        order = np.arange(len(s.t))
-        first = np.flatnonzero(s.t >= t)[: -1 if int(np.sum(s.t >= t)) % 2 else None]
-        order[first[0::2]], order[first[1::2]] = first[1::2], first[0::2]
-        return s.with_payload(s.payload[order])
-
-    return every_frame(exchange)(log, t)
-
-
-def broken_checksums(message: str) -> Edit:
-    """The Checksum's last bit is wrong."""
-
-    def edit(s: Stream, t: float) -> Stream:
-        payload = s.payload.copy()
-        payload[s.t >= t, checkable_byte(s.message)] ^= 1
-        return s.with_payload(payload)
-
-    return lambda log, t: log.changed(message, lambda s: edit(s, t))
-
-
-def joined_by(message: str, extra: int) -> Edit:
-    """A second sender adds frames to each one: a byte differs, counters jump, the Checksum is right."""
-
-    def edit(s: Stream, t: float) -> Stream:
-        origin = np.repeat(np.flatnonzero(s.t >= t), extra)
-        payload = s.payload[origin]
-        payload[:, 0] ^= 0x10
-        other = Stream(s.message, s.t[origin] + 0.001 * (1 + np.arange(len(origin)) % extra), payload)
-        counters = np.random.default_rng(7).integers(16, size=len(origin))
-        other = other.with_codes("Counter", counters, np.ones(len(origin), np.bool_))
-        stamps = np.concatenate([s.t, other.t])
-        order = np.argsort(stamps)
-        return Stream(s.message, stamps[order], np.concatenate([s.payload, other.payload])[order])
-
-    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+    return each(log.streams, twice)(log, t)
 
 
 def both(*edits: Edit) -> Edit:
     """One after the other."""
 
     def edit(log: Log, t: float) -> Log:
-        for each in edits:
-            log = each(log, t)
+        for change in edits:
+            log = change(log, t)
         return log
 
     return edit
