@@ -286,21 +286,6 @@ def test_a_log_cut_at_any_byte_is_whole_or_refused(lines, tmp_path, suffix):
     assert cut == list(range(1, data))
 
 
-def test_a_wild_sample_after_the_last_window_is_counted(lines, tmp_path):
-    some = [line for line in lines if float(line[1:18]) < START + SECONDS - 0.3]
-    place = [i for i, line in enumerate(some) if "18FE49" in line and float(line[1:18]) < START + SECONDS - 0.7][-1]
-    head, data = some[place].split("#")
-    faster = round(1.3 * int.from_bytes(bytes.fromhex(data[:4]), "little")).to_bytes(2, "little").hex()
-    some[place] = f"{head}#{faster}{data[4:]}"
-    (tmp_path / "a.log").write_text("".join(some))
-    pipeline = transcribing()
-    windows = windows_of([tmp_path / "a.log"], pipeline)
-    assert windows[-1]["t"] < float(some[place][1:18])
-    assert [w["rejected"] for w in windows] == [{}] * len(windows)
-    assert pipeline.intake.refusals.total == {"outlier": 1}
-    assert pipeline.intake.refusals.used == samples_in(some) - 1
-
-
 @pytest.mark.parametrize("by", [1e9, -1e7])
 def test_the_time_read_of_a_log_is_that_of_the_drive_where_its_clock_was_set(lines, tmp_path, by):
     (tmp_path / "a.log").write_text("".join([*lines[:200], *moved(lines[200:], by)]))

@@ -15,17 +15,10 @@ import numpy as np
 import pytest
 
 from soilbus.can.candump import frame_of
-from soilbus.can.dbc_files import load_databases
-from soilbus.can.log_writer import write_log
 from soilbus.estimation.window import Rig, SensorNoise
-from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
+from soilbus.offline.replay import LogError, read_frames, read_log
 from soilbus.pipeline.intake import coverage
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.sensors.bins import Bins
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
 
 LINES = [f"({i / 100:.6f}) can0 18FF2211#{i:016X}\n" for i in range(1000)]
 
@@ -126,22 +119,6 @@ def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
     share = dict(zip(rig.channels, coverage(store.window(0.0, 10.0), 0.5).tolist(), strict=True))
     assert share == dict.fromkeys(rig.channels, 0.0) | {"torque.A": 1.0, "load.B": 0.6, "draft": 0.1}
     assert not coverage(store.window(0.0, bin_length), 0.5).any()
-
-
-def test_windows_before_a_cut_come_before_its_error_with_an_estimator_beside(tmp_path):
-    config = reference_configuration()
-    log = tmp_path / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 14.0), seed=4), config), log)
-    log.write_bytes(log.read_bytes()[:-40])
-    seen: list[int] = []
-
-    def take_all(workers):
-        seen.extend(r.index for r in replay(Pipeline(config, load_databases(config)), [log], workers=workers))
-
-    with estimator_beside(config) as workers, pytest.raises(LogError, match="cut off"):
-        take_all(workers)
-    assert seen == [0, 1, 2, 3][: len(seen)]
-    assert len(seen) >= 3
 
 
 @pytest.mark.parametrize("gone", [3, 6, 12])

@@ -7,7 +7,6 @@ import lzma
 import re
 import tomllib
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -374,16 +373,6 @@ def test_priors_of_effects_grow_with_the_wheel_and_only_where_they_have_its_unit
         assert larger.parameters[0].high == pytest.approx(factors[0] * effect.parameters[0].high)
     depth = for_wheel(CATALOGUE["hardpan"], LOAD, 0.1 * RADIUS).parameters[1]
     assert depth.starts[0] == pytest.approx(0.1 * CATALOGUE["hardpan"].parameters[1].starts[0])
-
-
-def test_the_published_table_is_read_with_its_missing_torques(field_recording):
-    path: Path = field_recording("single-wheel-published.csv")
-    columns = {"wheel_load": "vertical_load_n", "drawbar_pull": "meas_drawbar_pull_n", "torque": "meas_torque_nm"}
-    columns |= {"sinkage": "meas_sinkage_m", "where": {"source": "hurrell2025_rashid1"}}
-    (run,) = runs_of(rig(**columns), path)
-    assert len(run.window.t) == 5
-    assert np.isnan(run.window.torque).all()
-    np.testing.assert_allclose(run.window.draft, [8.1, 8.6, 8.8, 9.6, 10.5])
 
 
 def test_check_lists_the_columns_and_what_they_tell():
