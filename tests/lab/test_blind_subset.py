@@ -7,7 +7,8 @@ import pytest
 from tests.golden.outputs import the_case
 from tests.lab.blind.cases import cases
 from tests.lab.blind.table import in_set
-from tests.lab.blind.trial import NOTHING, tried
+from tests.lab.blind.trial import tried
+from tests.lab.blind.visible import NOTHING
 
 
 @pytest.mark.parametrize("start", ["single/soil_drift:ramp/medium/", "single/inertia:flywheel/medium/"])
