@@ -92,14 +92,6 @@ def test_a_request_is_answered_with_the_claim(ours):
     assert ours.sent[0] == ours.sent[1]
 
 
-def test_a_node_with_a_larger_name_does_not_get_it(ours, other):
-    assert ours.until(lambda: ours.claim.holds)
-    rival = other(8)
-    assert ours.until(lambda: rival.state == rival.State.CANNOT_CLAIM)
-    assert ours.claim.holds
-    assert [identifier for identifier, _ in ours.sent] == [CLAIM, CLAIM]  # it said so again
-
-
 def test_a_node_with_a_smaller_name_takes_it(ours, other):
     assert ours.until(lambda: ours.claim.holds)
     rival = other(6)

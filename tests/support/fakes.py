@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from typing import Any
 
 import can
@@ -21,12 +22,13 @@ from soilbus.offline.played_bus import InlineExecutor, PlayedClock
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
+from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
 __all__ = [
     "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "feed_message",
+    "in_reverse",
 ]  # fmt: skip
 
 FakeClock = PlayedClock
@@ -35,6 +37,15 @@ FakeClock = PlayedClock
 def drive_messages(config: Config, seconds: float) -> list[can.Message]:
     """Frames of a good drive on loam: draft swings, slip is what the soil asks for."""
     return list(frames(simulate(config, excited("loam", seconds), 3), config))
+
+
+def in_reverse(recording: Recording) -> Recording:
+    """The same readings with the signs of a drive backward."""
+    turned = ("speed", "motor_speed", "torque", "draft", "pitch", "acceleration")
+    return replace(recording, channels={
+        name: replace(c, value=-c.value) if name.partition(".")[0] in turned else c
+        for name, c in recording.channels.items()
+    })  # fmt: skip
 
 
 def feed_message(admission: Admission, message: can.Message) -> None:
