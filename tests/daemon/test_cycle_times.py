@@ -18,23 +18,12 @@ from soilbus.decision.watch import Watch
 from soilbus.pipeline.outputs import (
     FAST_FRAMES,
     HOP_FRAMES,
-    check_cycle_times,
     forecast_frame,
     hop_frames,
     slip_frames,
 )
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-
-
-def checked(*overrides: str) -> None:
-    config = reference_configuration(overrides)
-    check_cycle_times(config, output_database(config))
-
-
-def test_frames_may_come_as_often_as_told_or_more_often():
-    checked()
-    checked("estimator.hop=0.5")
 
 
 def test_a_dbc_that_tells_the_longer_hop_is_accepted_and_one_with_too_fast_fast_frames_is_not(tmp_path):

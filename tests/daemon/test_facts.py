@@ -13,7 +13,6 @@ from in_vain import (
     TRIES,
     Story,
     halted_by_a_patch,
-    start_after_stop,
     stop_and_try,
     turned_onto,
     with_a_dead_axle,
@@ -179,15 +178,3 @@ def test_a_side_that_gives_way_takes_go_and_its_promises_away():
     assert not [p for p in odds if isinstance(p, float) and p > CONFIG.traversability.go]
     promised = [v["MaxDraft"] for _, of, v in after if of == "DraftCapability"]
     assert not [draft for draft in promised if isinstance(draft, float) and draft > 1.2 * most]
-
-
-@pytest.mark.parametrize(("machine", "rate", "top"), [("tractor", 0.1, 0.15), ("tractor-axles", 0.15, 1.2)])
-def test_a_start_that_succeeds_is_no_try_in_vain(machine, rate, top):
-    # However slowly it gets away, and however slowly it then creeps, on loam that resists a fifth of the weight.
-    config = MACHINES[machine]
-    story = start_after_stop(config, rate, top, seed=81)
-    sent = live(story.messages, config)
-    after = [state for at, state in states(sent) if at > story.begins]
-    assert "no_go" not in after
-    warned = {w for at, w in states(sent, "DemandForecast", "Warning") if at > story.begins}
-    assert "immobilisation" not in warned

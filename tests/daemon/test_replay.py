@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import gzip
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -14,13 +13,10 @@ import can
 import numpy as np
 import pytest
 
-from soilbus.can.candump import frame_of
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.offline.replay import LogError, read_frames, read_log
 from soilbus.pipeline.intake import coverage
 from soilbus.sensors.bins import Bins
-
-LINES = [f"({i / 100:.6f}) can0 18FF2211#{i:016X}\n" for i in range(1000)]
 
 
 def outcome(read: Callable[[Path], Iterator[Any]], path: Path) -> tuple[list[Any], str]:
@@ -30,52 +26,6 @@ def outcome(read: Callable[[Path], Iterator[Any]], path: Path) -> tuple[list[Any
     except LogError as error:
         return found, str(error)
     return found, ""
-
-
-def packed(text: str, keep: float = 1.0, flip: float | None = None) -> bytes:
-    data = bytearray(gzip.compress(text.encode(), mtime=0))
-    if flip is not None:
-        data[int(flip * len(data))] ^= 0xFF
-    return bytes(data[: int(keep * len(data))])
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "expected"),
-    [
-        ("whole.log", "".join(LINES).encode(), ""),
-        ("whole.v2.log.gz", packed("".join(LINES)), ""),
-        ("cut.log.gz", packed("".join(LINES), keep=0.6), "cut off or damaged after"),
-        ("flipped.log.gz", packed("".join(LINES), flip=0.6), "damaged after"),
-        ("line.log", "".join([*LINES[:700], "what is this\n", *LINES[700:]]).encode(), "damaged after 700 frames"),
-        ("bytes.log", "".join(LINES).encode() + b"\xff\xfe\n", "damaged after"),
-        ("prose.log", b"Dear diary,\n", "not a CAN log"),
-        ("empty.log", b"", "no frame in it"),
-        ("missing.log", None, "no such file"),
-        ("unknown.xyz", b"1", "not a CAN log"),
-    ],
-)
-def test_frames_and_errors_are_those_of_the_log_reader(
-    tmp_path: Path, name: str, data: bytes | None, expected: str
-) -> None:
-    path = tmp_path / name
-    if data is not None:
-        path.write_bytes(data)
-    frames, error = outcome(read_frames, path)
-    messages, peer_error = outcome(read_log, path)
-    assert frames == [frame_of(m) for m in messages]
-    assert error == peer_error
-    assert expected in error
-    assert bool(error) == bool(expected)
-
-
-def test_other_formats_are_read_too(tmp_path: Path) -> None:
-    path = tmp_path / "x.blf"
-    with can.BLFWriter(path) as log:
-        for i in range(5):
-            log(can.Message(timestamp=1.0 + i, arbitration_id=0x123, is_extended_id=False, data=bytes([i])))
-    frames = list(read_frames(path))
-    assert frames == [frame_of(m) for m in read_log(path)]
-    assert [(i, x, bytes(d)) for _, i, x, d, _, _ in frames] == [(0x123, False, bytes([i])) for i in range(5)]
 
 
 ASC = """date Fri Nov 27 10:00:00.000 am 2026

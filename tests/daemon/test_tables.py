@@ -16,16 +16,14 @@ from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
 from soilbus.cli.main import main
 from soilbus.config.file import parse_config
 from soilbus.config.model import Config, ConfigError
-from soilbus.decision.traversability import Status
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import TooLittle, record_of_rows
-from soilbus.diagnosis.verdict import Verdict, gap_limit
+from soilbus.diagnosis.verdict import gap_limit
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.columns import TableError
-from soilbus.offline.diagnose import diagnose_logs
 from soilbus.offline.tables import (
     candidates,
     recordings_of_tables,
@@ -36,9 +34,8 @@ from soilbus.offline.tables import (
 from soilbus.pipeline.outputs import json_line
 from soilbus.report.configuration import configuration_report
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Active, Effect
+from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import LOAD, RADIUS, for_wheel
-from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
 TRUTH = Soil(k_c=2e3, k_phi=1.5e6, n=0.8, phi=0.5, c=2e3, K=0.015)
@@ -110,14 +107,6 @@ def test_the_slips_error_is_that_of_one_less_the_ratio_of_speeds():
     window = window_of_rows(rig_of(config), t, values, rim_speed=20.0)
     np.testing.assert_allclose(window.variance["ground_speed"], (20.0 * NOISE["slip"]) ** 2)
     np.testing.assert_allclose(window.variance["speed"], 0.0)
-
-
-def test_rows_without_load_or_slip_are_left_out_and_counted(tmp_path):
-    columns = {"load": [900, "", 900, 900, -5], "slip": [0.1, 0.2, "", 1.0, 0.3], "pull": 5, "torque": 6, "sink": 0.01}
-    columns = {k: v if isinstance(v, list) else [v] * 5 for k, v in columns.items()}
-    (run,) = runs_of(rig(), write_csv(tmp_path / "a.csv", columns))
-    assert len(run.window.t) == 1
-    assert run.rejected == {"no_load": 1, "no_slip": 1, "slip_range": 1, "load_range": 1}
 
 
 def test_runs_are_recordings_and_where_picks_rows(tmp_path):
@@ -292,36 +281,6 @@ def test_estimates_from_twenty_rows_cover_the_truth(missing):
     assert (np.std(deviations, axis=0) > 0.5).all()  # and the intervals are no wider than need be
 
 
-def test_replay_of_a_table_is_a_window_for_each_run(tmp_path, measured):
-    n = len(measured["slip"])
-    path = write_csv(tmp_path / "t.csv", measured | {"bed": [i % 2 for i in range(n)]})
-    results = list(replay_tables(rig(run="bed"), [path, path]))
-    assert [r.index for r in results] == [0, 1, 2, 3]
-    for result in results:
-        assert result.status in (Status.VALID, Status.NOT_EXCITED)
-        true = (TRUTH.k_c / 0.3 + TRUTH.k_phi) * 0.02**TRUTH.n
-        assert abs(result.bearing.value - true) < 3.0 * result.bearing.std
-        assert result.slip["rig"] == pytest.approx(measured["slip"].mean(), abs=0.05)
-        assert '"bearing_pressure"' in json_line(result, rig())
-
-
-def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was(tmp_path):
-    rng = np.random.default_rng(5)
-    slips = np.linspace(0.03, 0.6, 12)
-    beds = (TRUTH, SOILS["upland_sandy_loam_51"])
-    effect = CATALOGUE["slip_sinkage"]
-    hidden = [Active(effect, effect.neutral | {"softening": 1.5})]
-    for active, verdict in (([], Verdict.NONE), (hidden, Verdict.NAMED)):
-        paths = [
-            write_csv(tmp_path / f"{i}.csv", noisy(sweep(soil, LOADS, slips, active), rng))
-            for i, soil in enumerate(beds)
-        ]
-        found = diagnose_logs(rig(), paths).diagnosis
-        assert found.verdict is verdict
-        assert [a.effect.name for a in found.additions] == [a.effect.name for a in active]
-    assert found.base.held_out_chi2 > 2.0 > 1.6 > found.completed.held_out_chi2
-
-
 def test_six_rows_with_nothing_missing_show_no_gap():
     """What four rows leave open of the soil is no gap: the reduced chi-square of the two others is 1 on average."""
     the_rig, model, prior = rig_of(rig()), model_of(rig()), prior_of(rig())
@@ -403,20 +362,6 @@ def test_the_command_line_takes_tables_and_answers_faults_in_one_line(tmp_path, 
         error = capsys.readouterr().err
         assert complaint in error
         assert error.count("\n") == 1
-
-
-def test_replay_of_tables_writes_the_daemons_json_and_summary(tmp_path, measured, capsys):
-    table = write_csv(tmp_path / "t.csv", measured)
-    config = tmp_path / "rig.toml"
-    config.write_text(RIG)
-    assert main(["replay", "--config", str(config), str(table), str(table), "--json", "-"]) == 0
-    windows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [window["window"] for window in windows] == [0, 1]
-    assert windows[0]["soil"] == windows[1]["soil"]
-    assert main(["replay", "--config", str(config), str(table)]) == 0
-    assert "1 windows from 1 tables" in capsys.readouterr().out
-    assert main(["replay", "--config", str(config), str(tmp_path / "none.csv")]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize("quieter", [5.0, 20.0, 40.0])

@@ -10,7 +10,7 @@ import pytest
 from soilbus.simulator.scenario import Patch
 from soilbus.terra.soils import soil_named
 from tests.golden.outputs import the_case
-from tests.lab.blind import command
+from tests.lab.blind import __main__ as command
 from tests.lab.blind import trial as trials
 from tests.lab.blind.calibration import curve, draw, stated
 from tests.lab.blind.cases import Case

@@ -87,26 +87,6 @@ def stop_and_try(config: Config, attempt: Try, seed: int, drives: float = 13.0, 
     return told(continued(done, config, waits + lasts, standing), config, seed, float(done.columns["t"][-1]) + waits)
 
 
-def start_after_stop(config: Config, rate: float, top: float, seed: int, lasts: float = 8.0) -> Story:
-    """A drive on loam, a stop, a wait of 1.5 s and a start at so many m/s^2 to the speed `top` [m/s]."""
-    waits = 1.5
-    done = driven(config, seed, 13.0, 0.5)
-    mass, drives = weight_of(config) / GRAVITY, rig_of(config).drives
-    resists = 0.2 * mass * GRAVITY  # what loam holds back rolling wheels by, as by brute force
-
-    def starting(t: np.ndarray) -> dict[str, np.ndarray]:
-        ground = np.clip(rate * (t - waits - SPIN_UP), 0.0, top)
-        speeds_up = np.where((ground > 0.0) & (ground < top), rate, 0.0)
-        on = np.clip((t - waits) / SPIN_UP, 0.0, 1.0)
-        force = on * (resists + mass * speeds_up) / drives.sum()
-        slips = 0.04 + 0.04 * speeds_up  # that loam needs for so little
-        rims = [ground / np.where(drive, 1.0 - slips, 1.0) for drive in drives]
-        torques = [force * w.radius * drive for w, drive in zip(config.wheel, drives, strict=True)]
-        return {"ground_speed": ground, "acceleration": speeds_up} | _wheels(config, rims, torques)
-
-    return told(continued(done, config, waits + lasts, starting), config, seed, float(done.columns["t"][-1]) + waits)
-
-
 def halted_by_a_patch(config: Config, seed: int, deceleration: float = 1.0, lasts: float = 8.0) -> Story:
     """Left wheels meet a soft patch and spin through open differentials until the vehicle stands, and go on."""
     done = driven(config, seed, 14.0, None)
@@ -138,12 +118,6 @@ def driven(config: Config, seed: int, seconds: float, deceleration: float | None
     draft = mean * (1.0 + 0.6 * np.sin(0.9 * at + phase))
     load = Profile([*at.tolist(), *ends], [*draft.tolist(), *[0.0 for _ in ends]])
     return drive(config, Scenario(seconds + stop, [Patch(0.0, soil)], speed, draft=load), seed)
-
-
-def weight_of(config: Config) -> float:
-    """Of the vehicle [N]."""
-    assert config.vehicle is not None
-    return config.vehicle.mass * GRAVITY
 
 
 def continued(
