@@ -17,10 +17,8 @@ from in_vain import (
     turned_onto,
     with_a_dead_axle,
     with_a_soft_side,
-    with_weak_motors,
 )
 from soilbus.can.dbc_files import load_databases
-from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import REFERENCES, reference_configuration
@@ -138,32 +136,6 @@ def test_motors_that_give_nothing_are_not_counted_on(dead):
         assert way.max_draft.value == pytest.approx(most, abs=max(4.0 * way.max_draft.std, 150.0))
     asked = [w.torque_available for w in judged]
     assert asked == pytest.approx([2.0 * 2400.0] * len(asked), rel=5e-3)
-
-
-WEAK = {"all": ("FL", "FR", "RL", "RR"), "one": ("RL",)}
-
-
-@pytest.mark.parametrize(("weak", "soil"), [("all", "loam"), ("one", "sandy_loam_15")])
-def test_motors_at_a_ceiling_below_their_limit_are_not_counted_on_for_more(weak, soil):
-    # Their limit says 2400 N m, they give 900; the truth is by brute force, without the service's model of a vehicle.
-    story, asked, most = with_weak_motors(CONFIG, WEAK[weak], soil, 91)
-    results = replayed(story.messages)
-    margin = CONFIG.traversability.margin
-    valid = [r for r in results if r.status is Status.VALID]
-    beyond = [r.traversability for r in valid if (1.0 + margin) * asked(r.t) > most]
-    assert len(beyond) >= 3
-    assert "go" not in {str(way.state) for way in beyond}
-    assert {way.limit for way in beyond} == {"torque"}
-    for way in beyond:
-        assert way.max_draft.value < most + 3.0 * way.max_draft.std
-        assert way.torque_available < 4 * 2400.0 - len(WEAK[weak]) // 2 * 1400.0
-
-
-def test_motors_that_give_what_they_say_keep_their_limit():
-    story, asked, most = with_weak_motors(CONFIG, (), "sandy_loam_23_michigan", seed=91)
-    results = replayed(story.messages)
-    assert [r.traversability.torque_available for r in results] == pytest.approx([9600.0] * len(results), rel=5e-3)
-    assert State.GO in {r.traversability.state for r in results if asked(r.t) < 0.6 * most}
 
 
 def test_a_side_that_gives_way_takes_go_and_its_promises_away():

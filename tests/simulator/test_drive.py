@@ -125,14 +125,6 @@ def test_implement_is_up_before_the_driver_gives_in_to_slip():
     assert columns["draft"].min() > -1e-6
 
 
-def test_a_weak_motor_limits_the_draft():
-    weak = drive(config("wheel.RL.max_torque=1000.0"), on("loam", draft=Swing(3000.0, 4500.0)), seed=4).columns
-    limited = weak["draft"] < weak["demand"] - 1.0
-    assert limited.any()
-    assert weak["torque.RL"][limited] == pytest.approx(1000.0, rel=1e-8)
-    assert weak["torque.RL"].max() < 1000.0 * (1 + 1e-8) < weak["torque.RR"].max()
-
-
 def test_rear_wheels_reach_the_next_soil_a_wheelbase_later():
     soils = (Patch(0.0, "loam"), Patch(15.0, "clayey_soil_38"))
     flat = {"speed": Swing(1.5, 1.5), "side_shift": Swing(0.0, 0.0), "slip_spread": 0.0, "transition": 0.01}

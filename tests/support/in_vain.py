@@ -23,11 +23,10 @@ from soilbus.simulator.sensors import measure
 from soilbus.terra.effects.effect import Active, Effect, Surroundings
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.soils import SOILS
-from soilbus.terra.vehicle import GRAVITY, axle_loads
+from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, WheelState
 from soilbus.trials.boggings import largest_draft
 from soilbus.trials.windows import torque_limits
-from statics import WEIGHT, wheel
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
@@ -210,88 +209,6 @@ def with_a_soft_side(config: Config, soft: str, seed: int, over: float = 3.0) ->
     scenario = replace(even, duration=float(t[-1]), slip=None, draft=draft)
     done = drive(config, scenario, seed, [softer(begins)])
     return told(done, config, seed, begins), most, held
-
-
-def with_weak_motors(
-    config: Config, weak: Sequence[str], soil: str, seed: int, ceiling: float = 900.0, seconds: float = 45.0
-) -> tuple[Story, Callable[[float], float], float]:
-    """Some wheels' motors give no more than `ceiling` [N m] though their limit says 2400; the draft rises and falls.
-
-    Rim speeds are controlled, the ground speed is by the equation of motion, and the driver lifts what halves it.
-    Second the mean draft [N] of the second before a time of the frames, third the most that is pulled steadily [N].
-    """
-    tables = {axle: _over_load_and_slip(SOILS[soil], *SIZES[axle]) for axle in SIZES}
-    ceilings = [ceiling if w.name in weak else 2400.0 for w in config.wheel]
-    mass, rim = WEIGHT / GRAVITY, 1.4
-
-    def wheels(slip: float, draft: float, rate: float) -> list[np.ndarray]:
-        """(pull, torque, angle, slip, load) of each wheel; a motor at its ceiling slips as much as that takes."""
-        front = (WEIGHT * 0.95 - draft * 0.45 - mass * rate * 0.75) / 1.95
-        loads = {"front": front / 2.0, "rear": (WEIGHT - front) / 2.0}
-        found = []
-        for w, most_torque in zip(config.wheel, ceilings, strict=True):
-            load = loads[str(w.axle)]
-            pull, torque, angle = (
-                np.array([np.interp(load, LOADS, column) for column in quantity]) for quantity in tables[str(w.axle)]
-            )
-            s = min(slip, float(np.interp(most_torque, torque, SLIPS)))
-            found.append(np.array([*(np.interp(s, SLIPS, q) for q in (pull, torque, angle)), s, load]))
-        return found
-
-    def steady(slip: float) -> float:
-        pull = 0.0
-        for _ in range(8):
-            pull = float(sum(w[0] for w in wheels(slip, pull, 0.0)))
-        return pull
-
-    most = max(steady(slip) for slip in np.linspace(0.05, 0.6, 23))
-    rng = np.random.default_rng([seed, 11])
-    t = np.arange(0.0, seconds, 1.0 / SAMPLE_RATE)
-    at = np.arange(0.0, seconds + 3.0, 2.5)
-    wanted = np.interp(t, at, rng.uniform(0.3, 1.25, len(at)) * most)
-    speed, rate, down, lifts = 0.95 * rim, 0.0, 1.0, False
-    rows, drafts = [], []
-    for wants in wanted.tolist():
-        lifts = speed < (0.9 if lifts else 0.5) * rim
-        down = max(down - 0.03, 0.0) if lifts else min(down + 0.01, 1.0)
-        draft = down * wants + (1.0 - down) * min(wants, 0.25 * most)
-        now = wheels(float(np.clip(1.0 - speed / rim, SLIPS[0], SLIPS[-1])), draft, rate)
-        rate = float(np.clip((sum(w[0] for w in now) - draft) / mass, -2.5, 2.5))
-        rows.append([speed, *np.ravel(now)])
-        drafts.append(draft)
-        speed = max(speed + rate / SAMPLE_RATE, 0.05)
-    ground, by_wheel = np.array(rows)[:, 0], np.array(rows)[:, 1:].reshape(len(t), len(config.wheel), 5)
-    columns = {"t": t, "ground_speed": ground, "acceleration": np.gradient(ground, t), "draft": np.array(drafts)}
-    columns["pitch"] = 0.0 * t
-    for i, w in enumerate(config.wheel):
-        _, torque, angle, slip, load = by_wheel[:, i].T
-        columns |= {
-            f"torque.{w.name}": torque,
-            f"load.{w.name}": load,
-            f"sinkage.{w.name}": w.radius * (1 - np.cos(angle)),
-        }
-        columns[f"speed.{w.name}"] = ground / (w.radius * (1.0 - slip))
-    done = driven(config, seed, 3.0, None)
-    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
-    story = told(replace(done, columns=rest | columns), config, seed, 0.0)
-
-    def asked(at: float) -> float:
-        since = at - story.begins
-        return float(columns["draft"][(t > since - 1.0) & (t <= since)].mean())
-
-    return story, asked, most
-
-
-SIZES = {"front": (0.50, 0.26), "rear": (0.62, 0.38)}
-LOADS = np.linspace(500.0, 12500.0, 9)
-SLIPS = np.array([-0.12, -0.06, 0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.33, 0.45, 0.6])
-
-
-def _over_load_and_slip(soil: Soil, radius: float, width: float) -> np.ndarray:
-    """Pull [N], torque [N m] and entry angle [rad] of one wheel (3, slip, load)."""
-    return np.array([[wheel(soil, load, slip, radius, width)[1:] for load in LOADS] for slip in SLIPS]).transpose(
-        2, 0, 1
-    )
 
 
 def with_full_limits(done: Drive, config: Config) -> Drive:

@@ -112,14 +112,6 @@ def test_lugs_shear_at_their_sides_as_bekker_has_it():
     assert with_effect("lugs", state, height=h, share=0.0)[2] == pytest.approx(true[2], rel=1e-12)
 
 
-def test_lugs_without_cohesion_are_a_greater_angle_of_friction():
-    state = state_on(soil_named("dry_sand"), 0.4, 0.3, 0.5, 0.3)._replace(c=0.0)
-    lugged = with_effect("lugs", state, height=0.05, share=0.0)
-    ratio = 0.05 / 0.3
-    factor = 1.0 + 0.64 * ratio * math.atan(1.0 / ratio)
-    assert lugged == pytest.approx(wheel_forces(state._replace(tan_phi=state.tan_phi * factor), MODEL), rel=1e-12)
-
-
 def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():
     """The substitute circle goes through both points; geometry by hand."""
     effect = CATALOGUE["tyre_deflection"]

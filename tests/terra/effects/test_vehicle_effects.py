@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.signal import lsim, lti
 
-from soilbus.terra.effects.along import stretches, through_low_pass
+from soilbus.terra.effects.along import stretches
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, wheel_with
 from soilbus.terra.effects.sensors import read_late
@@ -124,15 +124,6 @@ def test_a_filtered_torque_is_that_of_a_first_order_lag(lag):
     both = torque_of("torque_lag", torque, around, delay=0.25, time_constant=lag)
     queued = torque_of("torque_lag", torque, around, delay=0.25)
     assert both == pytest.approx(torque_of("torque_lag", queued, around, time_constant=lag), rel=1e-12)
-
-
-def test_a_low_pass_is_the_same_however_finely_it_is_looked_at():
-    t = np.cumsum(np.random.default_rng(5).uniform(0.05, 0.2, 60))
-    values = np.random.default_rng(6).normal(size=(60, 1))
-    fine = np.sort(np.concatenate([t, t[:-1] + 0.3 * np.diff(t)]))
-    between = np.interp(fine, t, values[:, 0])[:, None]
-    whole, divided = through_low_pass(t, values, 0.4), through_low_pass(fine, between, 0.4)
-    assert divided[np.isin(fine, t)] == pytest.approx(whole, rel=1e-10)
 
 
 def test_nothing_is_late_or_fast_across_a_gap():
