@@ -15,13 +15,7 @@ from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.decision.watch import Watch
-from soilbus.pipeline.outputs import (
-    FAST_FRAMES,
-    HOP_FRAMES,
-    forecast_frame,
-    hop_frames,
-    slip_frames,
-)
+from soilbus.pipeline.outputs import FAST_FRAMES, HOP_FRAMES, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 

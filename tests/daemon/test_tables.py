@@ -24,13 +24,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.columns import TableError
-from soilbus.offline.tables import (
-    candidates,
-    recordings_of_tables,
-    replay_tables,
-    runs_of,
-    window_of_rows,
-)
+from soilbus.offline.tables import candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
 from soilbus.pipeline.outputs import json_line
 from soilbus.report.configuration import configuration_report
 from soilbus.terra.effects.catalogue import CATALOGUE

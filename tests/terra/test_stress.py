@@ -10,13 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from soilbus.terra.soil_laws import (
-    SHEAR_LAWS,
-    exponential_shear,
-    normal_stress,
-    rational_shear,
-    shear_displacement,
-)
+from soilbus.terra.soil_laws import SHEAR_LAWS, exponential_shear, normal_stress, rational_shear, shear_displacement
 
 RATIOS = st.floats(-50.0, 50.0)
 

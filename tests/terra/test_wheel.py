@@ -71,11 +71,7 @@ def corners(slips: tuple[float, ...]) -> WheelState:
     return WheelState(angle, slip, R, B, 6e5, n, math.tan(0.4), 5e3, K)
 
 
-SITUATIONS = {
-    "drive": wheels(1, 24),
-    "skid": wheels(2, 16, slip=(-0.3, 0.0)),
-    "no slip": wheels(3, 4, slip=(0.0, 0.0)),
-}
+SITUATIONS = {"drive": wheels(1, 24), "skid": wheels(2, 16, slip=(-0.3, 0.0)), "no slip": wheels(3, 4, slip=(0.0, 0.0))}
 CORNERS = {"drive": corners((0.0, 0.3, 0.95)), "skid": corners((-0.3, -0.02))}
 
 

@@ -15,14 +15,7 @@ from soilbus.terra.effects.effect import Active, forces_with, wheel_with
 from soilbus.terra.effects.soil import SLIP_SINKAGE
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.soils import soil_named
-from soilbus.terra.wheel import (
-    INPUTS,
-    WheelModel,
-    WheelState,
-    state_on,
-    wheel_forces,
-    wheel_forces_and_derivatives,
-)
+from soilbus.terra.wheel import INPUTS, WheelModel, WheelState, state_on, wheel_forces, wheel_forces_and_derivatives
 from wheels_around import REAR, one_wheel, wheels_around
 
 MODEL = WheelModel("rational")
