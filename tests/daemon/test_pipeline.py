@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import math
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config
 from soilbus.decision.traversability import State, Status
+from soilbus.offline.replay import read_frames
 from soilbus.pipeline.outputs import json_line
 from soilbus.pipeline.pipeline import Pipeline
 
@@ -29,13 +29,7 @@ Frames = list[tuple[float, int, bool, bytes]]
 
 
 def read(path: Path) -> Frames:
-    frames = []
-    with gzip.open(path, "rt", encoding="ascii") as lines:
-        for line in lines:
-            stamp, _, frame = line.split()
-            identifier, _, data = frame.partition("#")
-            frames.append((float(stamp[1:-1]), int(identifier, 16), len(identifier) == 8, bytes.fromhex(data)))
-    return frames
+    return [(t, i, x, bytes(data)) for t, i, x, data, *_ in read_frames(path)]
 
 
 @pytest.fixture(scope="module")

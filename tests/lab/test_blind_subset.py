@@ -11,9 +11,8 @@ from tests.lab.blind.trial import tried
 from tests.lab.blind.visible import NOTHING
 
 
-@pytest.mark.parametrize("start", ["single/soil_drift:ramp/medium/", "single/inertia:flywheel/medium/"])
-def test_a_hidden_effect_is_named_by_another_formula(start):
-    case = the_case(start)
+def test_a_hidden_effect_is_named_by_another_formula():
+    case = the_case("single/inertia:flywheel/medium/")
     trial = tried(case, truth=NOTHING)
     assert trial.verdict == "named"
     assert trial.named == case.hidden

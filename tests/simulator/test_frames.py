@@ -6,7 +6,6 @@ import pytest
 
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases
-from soilbus.can.log_writer import write_log
 from soilbus.can.mapping import channels_of
 from soilbus.config.file import load_config, parse_config
 from soilbus.simulator.frames import START_TIME, encoded, frames
@@ -95,18 +94,6 @@ def test_what_is_not_known_is_not_available():
     group = by_name(frames(short, unlimited))["MotorFL"]
     limits = {str(DATABASE.decode_message(m.arbitration_id, m.data)["TorqueLimit"]) for m in group}
     assert limits == {"not_available"}
-
-
-def test_a_log_that_fails_midway_leaves_nothing(messages, tmp_path):
-    def breaking():
-        yield from messages[:10]
-        raise RuntimeError("the disk is gone")
-
-    with pytest.raises(RuntimeError):
-        write_log(breaking(), tmp_path / "drive.log")
-    with pytest.raises(ValueError, match="xyz"):
-        write_log(iter(messages[:10]), tmp_path / "drive.xyz")
-    assert list(tmp_path.iterdir()) == []
 
 
 FOREIGN = """VERSION ""

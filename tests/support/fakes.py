@@ -125,7 +125,8 @@ class ScriptedBus:
 class Bench:
     """A service on a scripted bus, by a clock that may go on from an earlier service.
 
-    `away` takes the bus's interface away.  `keeper` keeps its state; `pipeline` may have been prepared.
+    `away` takes the bus's interface away.  `keeper` keeps its state; `pipeline` may have been prepared.  `take` gets
+    the windows' results, which else are kept.
     """
 
     def __init__(
@@ -138,10 +139,11 @@ class Bench:
         pipeline: Pipeline | None = None,
         clock: FakeClock | None = None,
         claim: Any = None,
+        take: Callable[[WindowResult], None] | None = None,
     ) -> None:
         self.config = config or reference_configuration()
         self.clock = clock or FakeClock()
-        self.wire = ScriptedBus(self.clock, messages)
+        self.wire: Any = ScriptedBus(self.clock, messages)
         self.away = False
         self.database = output_database(self.config)
         own = [(message.frame_id, message.is_extended_frame) for message in self.database.messages]
@@ -150,7 +152,7 @@ class Bench:
         self.service = Service(
             self.config, pipeline or Pipeline(self.config, load_databases(self.config)), self.bus,
             Publisher(self.database), notifier or Notifier(), workers or InlineExecutor(), self.clock,
-            self.results.append, lambda: keeper, self.clock.wait_for, claim,
+            take or self.results.append, lambda: keeper, self.clock.wait_for, claim,
         )  # fmt: skip
 
     def _open(self) -> Any:

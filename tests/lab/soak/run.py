@@ -9,14 +9,10 @@ from typing import NamedTuple
 
 from cantools.database import Database
 
-from fakes import FakeClock, InlineExecutor
-from soilbus.can.bus import LiveBus
+from fakes import Bench, FakeClock
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
-from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.daemon.warm_up import warm_up
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
 from tests.lab.soak.figures import Beat, Estimates, Hour, resident_memory, unaccounted
@@ -66,14 +62,11 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
     clock = FakeClock()
     database, out = load_databases(config), output_database(config)
     warm_up(config, database, out)  # as start_service does
-    wire = Wire(clock, traffic_beside(config, seed), seed)
-    pipeline = Pipeline(config, database)
     estimator = config.estimator
     estimates = Estimates(soil_named(SOIL).bearing_pressure(estimator.z_ref, estimator.b_ref))
-    service = Service(
-        config, pipeline, LiveBus(lambda: wire, clock, clock.sleep), Publisher(out), Notifier(), InlineExecutor(),
-        clock, estimates.add,
-    )  # fmt: skip
+    bench = Bench(config=config, clock=clock, take=estimates.add)
+    bench.wire = wire = Wire(clock, traffic_beside(config, seed), seed)
+    service = bench.service
     verdict = out.get_message_by_name("Traversability").frame_id
     beat = Beat(CYCLE, SLACK, JITTER)
     wire.on_send = lambda t, message: beat.add(t) if message.arbitration_id == verdict else None
