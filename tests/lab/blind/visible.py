@@ -71,9 +71,9 @@ def shown(case: Case) -> Shown:
     """
     if not case.parts:
         return NOTHING
-    whole = driven_without_noise(case, case.parts)
     if rig_of(case.config).instrumentation is not None:
-        return _to_own_model(case, whole)
+        return shown_to_own_model(case)
+    whole = driven_without_noise(case, case.parts)
     left = [driven_without_noise(case, case.parts[:i] + case.parts[i + 1 :]) for i in range(len(case.parts))]
     count = int(min(recording.truth["t"][-1] for recording in (whole, *left)) / BIN)
     found = []
@@ -85,9 +85,9 @@ def shown(case: Case) -> Shown:
     return min(found, key=lambda each: each.energy)
 
 
-def _to_own_model(case: Case, whole: Recording) -> Shown:
+def shown_to_own_model(case: Case) -> Shown:
     """By a fit of the service's model of plain wheels; infinite where no fit ends."""
-    record = record_of_recording(case.id, whole, case.config)
+    record = record_of_recording(case.id, driven_without_noise(case, case.parts), case.config)
     fitted = FitCache([record], prior_of(case.config), record.options).fit(record.training.effects)
     if fitted is None:
         return Shown(np.inf, np.inf)
