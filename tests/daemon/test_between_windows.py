@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from fakes import feed_message
+from fakes import feed_message, in_reverse
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -31,7 +31,6 @@ from soilbus.terra.vehicle import axle_loads
 
 REAR_DRIVEN = reference_configuration(path=REFERENCES["tractor-2wd"])
 TWO_MOTORS = reference_configuration(path=REFERENCES["tractor-axles"])
-ALONG = ("speed", "motor_speed", "torque", "draft", "pitch", "acceleration")
 
 
 def fed(config, recording, silent: str = "", since: float = np.inf) -> tuple[Intake, float]:
@@ -52,14 +51,6 @@ def decided(config, recording):
     """Result of the first window."""
     intake, last = fed(config, recording)
     return WindowEstimator(config).solve(intake.finish(last)[0])
-
-
-def in_reverse(recording):
-    """The same readings with the signs of a drive backward."""
-    return replace(recording, channels={
-        name: replace(c, value=-c.value) if name.partition(".")[0] in ALONG else c
-        for name, c in recording.channels.items()
-    })  # fmt: skip
 
 
 def test_a_chassis_in_reverse_shifts_its_load_as_forces_the_other_way_do():

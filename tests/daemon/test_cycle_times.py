@@ -15,34 +15,9 @@ from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.decision.watch import Watch
-from soilbus.pipeline.outputs import (
-    FAST_FRAMES,
-    HOP_FRAMES,
-    check_cycle_times,
-    forecast_frame,
-    hop_frames,
-    slip_frames,
-)
+from soilbus.pipeline.outputs import FAST_FRAMES, HOP_FRAMES, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-
-
-def checked(*overrides: str) -> None:
-    config = reference_configuration(overrides)
-    check_cycle_times(config, output_database(config))
-
-
-def test_frames_may_come_as_often_as_told_or_more_often():
-    checked()
-    checked("estimator.hop=0.5")
-
-
-def test_a_hop_longer_than_the_dbc_tells_is_refused():
-    with pytest.raises(ConfigError) as refused:
-        checked("estimator.hop=2.0")
-    (fault,) = refused.value.faults
-    assert "SoilStrength" in fault
-    assert "every 1000 ms, but soilbus sends every 2000 ms" in fault
 
 
 def test_a_dbc_that_tells_the_longer_hop_is_accepted_and_one_with_too_fast_fast_frames_is_not(tmp_path):

@@ -14,7 +14,6 @@ import pytest
 
 from fakes import Bench, FakeClock, HeldExecutor, drive_messages
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.daemon.health import Health
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
@@ -169,18 +168,6 @@ def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
     healed = bench.run(8.0)
     assert any(t > healed for t in bench.systemd.fed)
     assert not bench.systemd.texts[-1].startswith("fault")
-
-
-def test_health_by_the_second():
-    health = Health(0.0)
-    assert health.fault(HARD_WINDOW, 0.0, True, 1) is None
-    assert health.fault(HARD_WINDOW + AT_LEAST, 0.0, True, 1).startswith("overload")
-    sent = HARD_WINDOW  # when `sent` has grown last
-    assert health.fault(sent + FULL_BUS, None, True, 1) is None
-    assert health.fault(sent + FULL_BUS + AT_LEAST, None, True, 1).startswith("internal")
-    silent = sent + FULL_BUS + AT_LEAST + 0.1
-    assert health.fault(silent, None, False, 1) is None
-    assert health.fault(silent + FULL_BUS, None, True, 1) is None
 
 
 def broken(estimator, windows: range):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fakes import feed_message
+from fakes import feed_message, in_reverse
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config, machine, parse_config
@@ -49,18 +48,14 @@ def spoilt(recorded: list[Frame], share: float = 0.01):
     return out, np.array(times)
 
 
-def windows(recorded: list[Frame], every: int = 200, glimpse: bool = False):
-    """The tasks of the frames, the clock looked at every so many of them, and the intake."""
+def windows(recorded: list[Frame]):
+    """The tasks of the frames, the clock looked at every 200 of them, and the intake."""
     config = load_config(FIELD_TOML)
     intake = Intake(config, load_databases(config))
     tasks = []
     for i, (t, identifier, extended, data, *_) in enumerate(recorded):
-        if i % every == 0:
+        if i % 200 == 0:
             tasks += intake.due(t)
-            if glimpse:  # as the live service does at every tick
-                intake.ingest()
-                slip = intake.latest(t).slip
-                assert all(s is None or -0.1 < s < 0.7 for s in slip.values())
         intake.admission.feed(t, identifier, extended, data)
     return tasks + intake.finish(recorded[-1][0]), intake
 
@@ -84,18 +79,6 @@ def test_wild_samples_are_left_out_and_counted(loam):
             assert name == "speed" or np.array_equal(a, b, equal_nan=True)
 
 
-@pytest.mark.parametrize(("every", "glimpse"), [(1, False), (40, True), (100_000, False)])
-def test_live_and_replay_give_the_same_windows(every, glimpse, loam):
-    frames_, _ = spoilt(loam, 0.03)
-    expected, _ = windows(frames_)
-    got, intake = windows(frames_, every, glimpse)
-    assert len(got) == len(expected)
-    for a, b in zip(got, expected, strict=True):
-        assert (a.rejected, a.slip, a.window.samples) == (b.rejected, b.slip, b.window.samples)
-        assert all(np.array_equal(getattr(a.window, q), getattr(b.window, q), equal_nan=True) for q in QUANTITIES)
-    assert intake.refusals.total["outlier"] > 10
-
-
 def test_a_wheel_without_a_speed_sensor_has_no_slip():
     raw = tomllib.loads(machine("tractor-2wd").read_text())
     for wheel in raw["wheel"]:
@@ -113,26 +96,15 @@ def test_a_wheel_without_a_speed_sensor_has_no_slip():
 
 def test_slip_in_reverse_is_that_of_the_same_drive_forward():
     config = reference_configuration()
-    recording = simulate(config, excited("loam", 11.5), seed=3)
-    reversed_ = {
-        name: dataclasses.replace(c, value=-c.value)
-        if name.partition(".")[0] in ("speed", "torque", "draft", "pitch", "acceleration")
-        else c
-        for name, c in recording.channels.items()
-    }
+    database, recording = load_databases(config), simulate(config, excited("loam", 11.5), seed=3)
     slips = []
-    for channels in (recording.channels, reversed_):
-        database = load_databases(config)
-        intake = Intake(config, database)
-        tasks = []
-        for m in frames(dataclasses.replace(recording, channels=channels), config, database):
+    for driven in (recording, in_reverse(recording)):
+        intake, tasks = Intake(config, database), []
+        for m in frames(driven, config, database):
             tasks += intake.due(m.timestamp)
             feed_message(intake.admission, m)
-            last = m.timestamp
-        slips += [[*tasks[0].slip.values(), *intake.latest(last).slip.values()]]
         intake.ingest()
-        slips[-1] += intake.latest(last).slip.values()
+        slips.append([*tasks[0].slip.values(), *intake.latest(m.timestamp).slip.values()])
     ahead, back = slips
-    assert all(0.0 < s < 0.5 for s in ahead[:4] + ahead[8:])
-    assert back[:4] == pytest.approx(ahead[:4], abs=1e-3)  # codes are rounded
-    assert back[8:] == pytest.approx(ahead[8:], abs=1e-3)
+    assert all(0.0 < s < 0.5 for s in ahead)
+    assert back == pytest.approx(ahead, abs=1e-3)  # codes are rounded

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import can
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -229,14 +228,6 @@ def test_no_line_is_drawn_across_logs_or_a_set_clock(lines, tmp_path):
     assert stretches([replace(r, t=0.0) for r in results[:2]]) == [[replace(r, t=0.0)] for r in results[:2]]
 
 
-def test_one_step_of_the_clock_makes_no_window_wait(lines, tmp_path):
-    back = lines[: len(lines) // 2] + moved(lines[len(lines) // 2 :], -3.0)
-    (tmp_path / "a.log").write_text("".join(back))
-    windows = windows_of([tmp_path / "a.log"])
-    assert [w["t"] - START for w in windows] == pytest.approx([4.0, 4.5 - 3.0 + 4.0], abs=0.02)
-    assert {w["status"] for w in windows} == {"valid"}  # no pause in them
-
-
 # --- damaged logs
 
 
@@ -293,40 +284,6 @@ def test_a_log_cut_at_any_byte_is_whole_or_refused(lines, tmp_path, suffix):
         assert intake.refusals.total.keys() <= {"wrong_length"}
     data = line.index("#") + 1 + 16  # classic frames of eight bytes
     assert cut == list(range(1, data))
-
-
-def test_a_cut_frame_is_one_line_and_partial_keeps_the_windows_before(lines, tmp_path, capsys):
-    log, out = tmp_path / "cut.log", tmp_path / "o.jsonl"
-    log.write_text("".join(lines[:-1]) + lines[-1].rstrip()[:-7].rstrip())
-    arguments = ["replay", "--config", str(TRACTOR), "--set", *SHORT, str(log), "--json", str(out)]
-    assert main(arguments) == 1
-    assert "cut off" in capsys.readouterr().err
-    assert not out.exists()
-    assert main([*arguments, "--partial"]) == 0
-    assert len(out.read_text().splitlines()) == 5
-    with pytest.raises(LogError, match="cut off"):
-        recordings_of(CONFIG, DATABASE, [log])
-
-
-def test_a_wild_sample_after_the_last_window_is_counted(lines, tmp_path):
-    some = [line for line in lines if float(line[1:18]) < START + SECONDS - 0.3]
-    place = [i for i, line in enumerate(some) if "18FE49" in line and float(line[1:18]) < START + SECONDS - 0.7][-1]
-    head, data = some[place].split("#")
-    faster = round(1.3 * int.from_bytes(bytes.fromhex(data[:4]), "little")).to_bytes(2, "little").hex()
-    some[place] = f"{head}#{faster}{data[4:]}"
-    (tmp_path / "a.log").write_text("".join(some))
-    pipeline = transcribing()
-    windows = windows_of([tmp_path / "a.log"], pipeline)
-    assert windows[-1]["t"] < float(some[place][1:18])
-    assert [w["rejected"] for w in windows] == [{}] * len(windows)
-    assert pipeline.intake.refusals.total == {"outlier": 1}
-    assert pipeline.intake.refusals.used == samples_in(some) - 1
-
-
-def test_a_log_keeps_the_stamps_of_a_clock_that_was_set_back(tmp_path):
-    messages = [can.Message(timestamp=t, arbitration_id=1, data=[1]) for t in (1.7e9, 1.7e9 + 1.0, 1.6e9, 1.6e9 + 1.0)]
-    write_log(messages, tmp_path / "a.log")
-    assert [m.timestamp for m in can.CanutilsLogReader(tmp_path / "a.log")] == [m.timestamp for m in messages]
 
 
 @pytest.mark.parametrize("by", [1e9, -1e7])

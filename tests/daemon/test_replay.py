@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import gzip
 import math
 import re
 import sys
@@ -15,20 +14,10 @@ import can
 import numpy as np
 import pytest
 
-from soilbus.can.candump import frame_of
-from soilbus.can.dbc_files import load_databases
-from soilbus.can.log_writer import write_log
 from soilbus.estimation.window import Rig, SensorNoise
-from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
+from soilbus.offline.replay import LogError, read_frames, read_log
 from soilbus.pipeline.intake import silences
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.sensors.bins import Bins
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
-
-LINES = [f"({i / 100:.6f}) can0 18FF2211#{i:016X}\n" for i in range(1000)]
 
 
 def outcome(read: Callable[[Path], Iterator[Any]], path: Path) -> tuple[list[Any], str]:
@@ -38,52 +27,6 @@ def outcome(read: Callable[[Path], Iterator[Any]], path: Path) -> tuple[list[Any
     except LogError as error:
         return found, str(error)
     return found, ""
-
-
-def packed(text: str, keep: float = 1.0, flip: float | None = None) -> bytes:
-    data = bytearray(gzip.compress(text.encode(), mtime=0))
-    if flip is not None:
-        data[int(flip * len(data))] ^= 0xFF
-    return bytes(data[: int(keep * len(data))])
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "expected"),
-    [
-        ("whole.log", "".join(LINES).encode(), ""),
-        ("whole.v2.log.gz", packed("".join(LINES)), ""),
-        ("cut.log.gz", packed("".join(LINES), keep=0.6), "cut off or damaged after"),
-        ("flipped.log.gz", packed("".join(LINES), flip=0.6), "damaged after"),
-        ("line.log", "".join([*LINES[:700], "what is this\n", *LINES[700:]]).encode(), "damaged after 700 frames"),
-        ("bytes.log", "".join(LINES).encode() + b"\xff\xfe\n", "damaged after"),
-        ("prose.log", b"Dear diary,\n", "not a CAN log"),
-        ("empty.log", b"", "no frame in it"),
-        ("missing.log", None, "no such file"),
-        ("unknown.xyz", b"1", "not a CAN log"),
-    ],
-)
-def test_frames_and_errors_are_those_of_the_log_reader(
-    tmp_path: Path, name: str, data: bytes | None, expected: str
-) -> None:
-    path = tmp_path / name
-    if data is not None:
-        path.write_bytes(data)
-    frames, error = outcome(read_frames, path)
-    messages, peer_error = outcome(read_log, path)
-    assert frames == [frame_of(m) for m in messages]
-    assert error == peer_error
-    assert expected in error
-    assert bool(error) == bool(expected)
-
-
-def test_other_formats_are_read_too(tmp_path: Path) -> None:
-    path = tmp_path / "x.blf"
-    with can.BLFWriter(path) as log:
-        for i in range(5):
-            log(can.Message(timestamp=1.0 + i, arbitration_id=0x123, is_extended_id=False, data=bytes([i])))
-    frames = list(read_frames(path))
-    assert frames == [frame_of(m) for m in read_log(path)]
-    assert [(i, x, bytes(d)) for _, i, x, d, _, _ in frames] == [(0x123, False, bytes([i])) for i in range(5)]
 
 
 ASC = """date Fri Nov 27 10:00:00.000 am 2026
@@ -127,38 +70,6 @@ def test_silent_half_seconds_of_each_channel_add_up(bin_length: float) -> None:
     silent = dict(zip(rig.channels, silences(store.window(0.0, 10.0), 0.5), strict=True))
     assert silent == dict.fromkeys(rig.channels, 10.0) | {"torque.A": 0.0, "load.B": 4.0, "draft": 9.0}
     assert min(silences(store.window(0.0, bin_length), 0.5)) == math.inf
-
-
-def test_an_estimator_beside_gives_the_same_results(tmp_path):
-    config = reference_configuration()
-    log = tmp_path / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 14.0), seed=4), config), log)
-
-    def results(workers):
-        return [repr(r) for r in replay(Pipeline(config, load_databases(config)), [log], workers=workers)]
-
-    with estimator_beside(config) as workers:
-        assert workers is not None
-        beside = results(workers)
-    assert any("warning=<Alert.NONE" in result for result in beside)  # watched, in replay too
-    assert len(beside) == 4
-    assert beside == results(None)
-
-
-def test_windows_before_a_cut_come_before_its_error_with_an_estimator_beside(tmp_path):
-    config = reference_configuration()
-    log = tmp_path / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 14.0), seed=4), config), log)
-    log.write_bytes(log.read_bytes()[:-40])
-    seen: list[int] = []
-
-    def take_all(workers):
-        seen.extend(r.index for r in replay(Pipeline(config, load_databases(config)), [log], workers=workers))
-
-    with estimator_beside(config) as workers, pytest.raises(LogError, match="cut off"):
-        take_all(workers)
-    assert seen == [0, 1, 2, 3][: len(seen)]
-    assert len(seen) >= 3
 
 
 @pytest.mark.parametrize("gone", [3, 6, 12])

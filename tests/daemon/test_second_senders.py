@@ -10,25 +10,17 @@ import can
 import numpy as np
 import pytest
 
-from fakes import Bench, drive_messages
+from fakes import Bench, Notes, drive_messages
 from soilbus.can.candump import frame_of
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
-from soilbus.daemon.notify import Notifier
 from soilbus.sensors.survey import survey
 from soilbus.simulator.reference import reference_configuration
 
 CONFIG, DURATION = reference_configuration(), 16.0
 MOTOR = load_databases(CONFIG).get_message_by_name("MotorFL").frame_id
-
-
-class Notes(Notifier):
-    """The notifier's place: what the status was."""
-
-    def status(self, text: str) -> None:
-        self.said = text
 
 
 @pytest.fixture(scope="module")

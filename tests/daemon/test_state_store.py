@@ -34,11 +34,11 @@ from soilbus.daemon.state_store import (
     write_whole,
 )
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.simulator.reference import REAR_DRIVE, reference_configuration
+from soilbus.simulator.reference import REAR_DRIVE, TRACTOR, reference_configuration
 
 
-def owner_of(settings: list[str] | None = None, database=None) -> Owner:
-    config = reference_configuration(settings or [])
+def owner_of(settings: list[str] | None = None, database=None, path=TRACTOR) -> Owner:
+    config = reference_configuration(settings or [], path)
     database = database or load_databases(config)
     return Owner.of(config, channels_of(config, database), database)
 
@@ -152,7 +152,6 @@ def _indefinite(state):
     ("content", "why"),
     [
         (b"", "not JSON"),
-        (CONTENT[:-3], "not JSON"),
         (b"[" * 100_000, "not JSON"),
         (b'{"at": ' + b"9" * 5000 + b"}", "not JSON"),
         (b'"soilbus state"', "not a state of soilbus"),
@@ -163,24 +162,17 @@ def _indefinite(state):
         (sealed(lambda s: s.update(more=1)), "more"),
         (sealed(lambda s: s.pop("totals")), "totals"),
         (sealed(lambda s: s.update(starts=0)), "starts"),
-        (sealed(lambda s: s.update(starts="3")), "starts"),
         (sealed(lambda s: s.update(at=float("nan"))), "at"),
         (sealed(lambda s: s["totals"].update(windows=-1)), "windows"),
-        (sealed(lambda s: s["totals"].update({f"x{i}": 1 for i in range(2000)})), "totals"),
         (sealed(lambda s: s["gaussian"]["soil"].pop("phi")), "other parameters"),
         (sealed(lambda s: s["gaussian"]["gains"].update({"torque.XX": 0.0})), "other parameters"),
-        (sealed(lambda s: s["gaussian"]["covariance"].pop()), "another shape"),
         (sealed(lambda s: s["gaussian"]["covariance"][3].pop()), "another shape"),
         (sealed(lambda s: s["gaussian"]["soil"].update(phi=1.5)), "physical bounds"),
-        (sealed(lambda s: s["gaussian"]["soil"].update(n=0.0)), "physical bounds"),
         (sealed(lambda s: s["gaussian"]["soil"].update(k_phi=1e30)), "physical bounds"),
-        (sealed(lambda s: s["gaussian"]["soil"].update(k_phi=1e-30)), "physical bounds"),
         (sealed(lambda s: s["gaussian"]["gains"].update({"torque.FL": 0.5})), "physical bounds"),
         (sealed(lambda s: s["gaussian"]["gains"].update({"torque.FL": -0.5})), "physical bounds"),
         (sealed(lambda s: s["gaussian"]["gains"].update({"torque.FL": float("inf")})), "torque.FL"),
         (sealed(lambda s: _covariance(s, 2, 2, 0.0)), "positive definite"),
-        (sealed(lambda s: _covariance(s, 2, 2, -1.0)), "positive definite"),
-        (sealed(lambda s: _covariance(s, 2, 2, 5e-324)), "positive definite"),
         (sealed(lambda s: _covariance(s, 2, 2, 1e300)), "out of bounds"),
         (sealed(lambda s: _scaled(s, 9, 1.5)), "not symmetric"),
         (sealed(_indefinite), "positive definite"),
@@ -208,58 +200,32 @@ def test_what_is_held_and_what_effects_have_is_stored_too():
         stored_gaussian(other, 0.0, owner)
 
 
-def test_a_belief_that_could_not_be_read_back_is_not_stored():
-    gaussian = belief_with(2)
-    for spoilt in (
-        Gaussian(gaussian.soil * np.nan, gaussian.gains, gaussian.covariance),
-        Gaussian(gaussian.soil, gaussian.gains + 1.0, gaussian.covariance),
-        Gaussian(gaussian.soil, gaussian.gains, -gaussian.covariance),
-    ):
-        with pytest.raises(StateError):
-            stored_gaussian(spoilt, 0.0, OWNER)
-
-
 @pytest.mark.parametrize(
-    "setting",
+    ("setting", "path"),
     [
-        "wheel.FL.radius=0.51", "vehicle.mass=2301.0", "noise.draft.gain=0.006", "soil.c.value=2100.0",
-        "estimator.window=9.0", "model.shear_law=rational", "wheel.FL.gear_ratio=25.0",
+        ("wheel.FL.radius=0.51", TRACTOR), ("vehicle.mass=2301.0", TRACTOR), ("noise.draft.gain=0.006", TRACTOR),
+        ("soil.c.value=2100.0", TRACTOR), ("estimator.window=9.0", TRACTOR), ("model.shear_law=rational", TRACTOR),
+        ("wheel.FL.gear_ratio=25.0", TRACTOR), ("axle.rear.differential=limited", REAR_DRIVE),
+        ("axle.rear.torque_bias=0.2", REAR_DRIVE),
     ],
 )  # fmt: skip
-def test_what_a_belief_depends_on_is_in_the_key(setting):
-    assert owner_of([setting]).key != OWNER.key
+def test_what_a_belief_depends_on_is_in_the_key(setting, path):
+    assert owner_of([setting], path=path).key != owner_of(path=path).key
 
 
-def test_the_differential_of_an_axle_is_in_the_key():
-    def key(*settings: str) -> str:
-        config = reference_configuration(settings, REAR_DRIVE)
-        database = load_databases(config)
-        return Owner.of(config, channels_of(config, database), database).key
-
-    assert len({key(), key("axle.rear.differential=limited"), key("axle.rear.torque_bias=0.2")}) == 3
-
-
-def test_the_wiring_is_in_the_key_down_to_the_bit():
+def test_the_wiring_is_in_the_key_down_to_the_bit_and_the_page():
     config = reference_configuration()
     database = copy.deepcopy(load_databases(config))
     channel = channels_of(config, database)[0]
     signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
-    assert owner_of(database=database).key == OWNER.key
+    keys = {OWNER.key, owner_of(database=database).key}
+    assert len(keys) == 1
     signal.conversion.offset += 1.0
-    assert owner_of(database=database).key != OWNER.key
-
-
-def test_the_page_of_a_multiplexed_signal_is_in_the_key():
-    config = reference_configuration()
-    database = copy.deepcopy(load_databases(config))
-    channel = channels_of(config, database)[0]
-    signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
+    keys.add(owner_of(database=database).key)
     signal.multiplexer_signal = "State"
-    keys = set()
-    for pages in ([1], [2]):
-        signal.multiplexer_ids = pages
+    for signal.multiplexer_ids in ([1], [2]):
         keys.add(owner_of(database=database).key)
-    assert len(keys | {OWNER.key}) == 3
+    assert len(keys) == 4
 
 
 @pytest.mark.parametrize("setting", ["bus.channel=can7", "traversability.margin=0.2", "output.dbc=soilbus.dbc"])

@@ -9,10 +9,9 @@ import pytest
 
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.terra.wheel import Soil
-from tests.lab.blind.bound import bound
 from tests.lab.blind.cases import Case, cases
-from tests.lab.blind.trial import NOTHING, tried
-from tests.lab.blind.visible import driven_without_noise
+from tests.lab.blind.trial import tried
+from tests.lab.blind.visible import NOTHING, driven_without_noise, shown_to_own_model
 
 
 def case_of(kind: str, seed: int, number: int) -> Case:
@@ -47,11 +46,10 @@ def test_loads_that_shake_are_no_effect() -> None:
 @pytest.mark.parametrize(("number", "least"), [(140, 100.0), (14, 50.0)])
 def test_an_effect_that_such_a_recording_shows_is_named(number: int, least: float) -> None:
     case = case_of("single", 501, number)
-    found = tried(case, truth=NOTHING)
-    assert found.bound is not None
-    assert found.bound > least
+    found = tried(case)
+    assert found.visible > least
     assert found.named[0] == case.hidden[0]
 
 
-def test_the_bound_is_nothing_where_nothing_is_hidden() -> None:
-    assert bound(case_of("plain", 502, 12)) == pytest.approx(0.0, abs=5.0)
+def test_nothing_is_shown_where_nothing_is_hidden() -> None:
+    assert shown_to_own_model(case_of("plain", 502, 12)).energy == pytest.approx(0.0, abs=5.0)

@@ -469,13 +469,13 @@ def test_check_predicts_the_errors_of_a_machine_that_tows_nothing():
 
 def test_a_draft_that_nothing_measures_does_not_bias_a_machine_without_load_cells(monkeypatch):
     """Rear-driven, nothing but torque, speeds, pitch: 16 windows on sand; tan phi was 1.8 sd too low in the mean."""
-    known = computed_loads.configured("tractor-2wd", "axle cells")
+    known = computed_loads.configured("tractor-2wd")
     bare = known.model_copy(update={
         "signals": known.signals.model_copy(update={"draft": None}),
         "axle": [axle.model_copy(update={"load": None}) for axle in known.axle],
     })  # fmt: skip
-    monkeypatch.setattr(computed_loads, "configured", lambda machine, cells: bare)
-    tasks = [computed_loads.Task("tractor-2wd", "none", "dry_sand", 0.03, seed) for seed in range(16)]
+    monkeypatch.setattr(computed_loads, "configured", lambda machine: bare)
+    tasks = [computed_loads.Task("tractor-2wd", "dry_sand", 0.03, seed) for seed in range(16)]
     off = np.array([one for one in map(computed_loads.errors, tasks) if one is not None])
     assert len(off) >= 15
     assert np.all(np.abs(off.mean(axis=0)) < 1.2)

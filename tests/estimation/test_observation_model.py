@@ -256,7 +256,7 @@ def test_rows_that_one_latent_swamps_have_a_finite_inverse():
 def test_a_fit_behind_an_open_differential_converges_where_loads_shake(seed):
     # Side loads follow from equal torques.  Where their noise is not in the weights and they are not in the Jacobian,
     # -2 log posterior rises along the step and the descent ends at its limit.
-    task = computed_loads.Task("tractor-2wd", "axle cells", "loam", 0.12, seed)
+    task = computed_loads.Task("tractor-2wd", "loam", 0.12, seed)
     problem, prior = computed_loads.window_of(task)
     fit = fit_window(problem, prior)
     assert fit.converged

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,7 +20,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--exact", action="store_true", help="no tolerances: nothing may move in its six digits")
     parser.add_argument("--only", default="", help="only outputs with this in their name")
     parser.add_argument("--first", type=int, default=30, help="rows of the largest moves (30)")
-    parser.add_argument("--json", type=Path, help="write one object a line for each difference")
     parser.add_argument("--drive-again", action="store_true", help="first simulate the recordings anew")
     chosen = parser.parse_args(arguments)
     if chosen.drive_again:
@@ -31,8 +29,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for source in (*replays(), *diagnoses()):
         if chosen.only in source.name:
             found += _compared(source, limits, chosen.renew)
-    if chosen.json is not None:
-        chosen.json.write_text("".join(json.dumps(move._asdict()) + "\n" for move in found))
     print(summary(found, chosen.first))
     return int(not chosen.renew and any(move.fails for move in found))
 

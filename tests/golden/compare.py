@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -76,64 +76,60 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
+Path = tuple[str, ...]
+_Seen = tuple[Kind, Any, Any, float, str]
+
+
 def moves(output: str, old: Sequence[Any], new: Sequence[Any], tolerances: Tolerances) -> list[Move]:
     """All differences of two outputs, each a list of objects; windows are known by their number."""
-    before, after = _by_identity(old), _by_identity(new)
-    found: list[Move] = []
-    for part in _union(before, after):
-        place: tuple[str, str] = (output, part if "window" in (before.get(part) or after[part]) else "")
-        if part not in after:
-            found.append(Move(*place, "", Kind.GONE, _short(before[part]), None, float("inf"), ""))
-        elif part not in before:
-            found.append(Move(*place, "", Kind.CHANGED, None, _short(after[part]), float("inf"), "more than before"))
-        else:
-            found += (
-                Move(place[0], place[1], *rest) for rest in _walk(before[part], after[part], (), None, tolerances)
-            )
+    before, after = _flat(list(old)), _flat(list(new))
+    windows = {path for found in (before, after) for path in found if path[1:] == ("window",)}
+    found = []
+    for path in (*before, *(path for path in after if path not in before)):
+        difference = _difference(path, before, after, tolerances)
+        if difference is not None:
+            part = path[0] if (*path[:1], "window") in windows else ""
+            found.append(Move(output, part, ".".join(path[1:]), *difference))
     return found
 
 
-_Rest = tuple[str, Kind, Any, Any, float, str]
+def _flat(value: Any, path: Path = ()) -> dict[Path, Any]:
+    """The values by the way to them; of objects and lists the type, and all that is in them."""
+    if not isinstance(value, dict | list):
+        return {path: value}
+    inner = _by_identity(value) if isinstance(value, list) else value
+    return {path: type(value)} | {
+        place: v for key, one in inner.items() for place, v in _flat(one, (*path, key)).items()
+    }
 
 
-def _walk(old: Any, new: Any, path: tuple[str, ...], std: Any, limits: Tolerances) -> Iterator[_Rest]:
-    """Differences of two values; std: what stands beside the old one as its standard deviation, None for nothing."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in _union(old, new):
-            yield from _child(old, new, key, path, limits)
-    elif isinstance(old, list) and isinstance(new, list):
-        before, after = _by_identity(old), _by_identity(new)
-        for key in _union(before, after):
-            beside = std[int(key)] if isinstance(std, list) and key.isdigit() and int(key) < len(std) else None
-            yield from _item(before, after, key, path, beside, limits)
-    elif _is_number(old) and _is_number(new):
-        yield from _number(old, new, path, std, limits)
-    elif old != new or type(old) is not type(new):
-        yield ".".join(path), Kind.CHANGED, _short(old), _short(new), float("inf"), ""
+def _difference(path: Path, before: dict[Path, Any], after: dict[Path, Any], limits: Tolerances) -> _Seen | None:
+    """Kind, old and new value, size and what a reader sees of it; None for what a parent says or no move at all."""
+    here, inf = path[:-1], float("inf")
+    old: Any = before.get(path)
+    new: Any = after.get(path)
+    if path and before.get(here) is not after.get(here):
+        return None
+    if path not in after:
+        return Kind.GONE, _short(old), None, inf, ""
+    if path not in before:
+        if before[here] is list or here[-1] in BY_DATA:
+            return Kind.CHANGED, None, _short(new), inf, "more than before"
+        return Kind.ADDED, None, _short(new), 0.0, ""
+    if _is_number(old) and _is_number(new):
+        return _moved(path, old, new, before.get(_beside(path)), limits)
+    return None if old == new and type(old) is type(new) else (Kind.CHANGED, _short(old), _short(new), inf, "")
 
 
-def _child(old: dict[str, Any], new: dict[str, Any], key: str, path: tuple[str, ...], limits: Tolerances) -> Any:
-    if key not in old and not BY_DATA & {*path[-1:]}:
-        yield ".".join((*path, key)), Kind.ADDED, None, _short(new[key]), 0.0, ""
-        return
-    beside = old.get("std") if key == "value" else old.get(f"{key}_std")
-    yield from _item(old, new, key, path, beside, limits)
+def _beside(path: Path) -> Path:
+    """Where the std of a value stands."""
+    *there, key = path
+    if key == "value":
+        return (*there, "std")
+    return (*there[:-1], f"{there[-1]}_std", key) if key.isdigit() else (*there, f"{key}_std")
 
 
-def _item(
-    old: dict[str, Any], new: dict[str, Any], key: str, path: tuple[str, ...], std: Any, limits: Tolerances
-) -> Iterator[_Rest]:
-    here = (*path, key)
-    if key not in new:
-        yield ".".join(here), Kind.GONE, _short(old[key]), None, float("inf"), ""
-    elif key not in old:
-        yield ".".join(here), Kind.CHANGED, None, _short(new[key]), float("inf"), "more than before"
-    else:
-        yield from _walk(old[key], new[key], here, std, limits)
-
-
-def _number(old: float, new: float, path: tuple[str, ...], std: Any, limits: Tolerances) -> Iterator[_Rest]:
-    apart = abs(new - old)
+def _moved(path: Path, old: float, new: float, std: Any, limits: Tolerances) -> _Seen | None:
     if isinstance(old, int) and isinstance(new, int):
         limit, by = 0.0, f"{new - old:+d}"
     elif "recording" in path:
@@ -145,9 +141,9 @@ def _number(old: float, new: float, path: tuple[str, ...], std: Any, limits: Tol
     else:
         limit, by = limits.relative * abs(old), _share(old, new)
     last_digit = 10.0 ** (1 - DIGITS) * max(abs(old), abs(new)) if limit > 0.0 else 0.0
-    if apart > max(limit, last_digit):
-        size = apart / limit if limit > 0.0 else float("inf")
-        yield ".".join(path), Kind.MOVED, old, new, size, by
+    if abs(new - old) <= max(limit, last_digit):
+        return None
+    return Kind.MOVED, old, new, abs(new - old) / limit if limit > 0.0 else float("inf"), by
 
 
 def _share(old: float, new: float) -> str:
@@ -156,10 +152,6 @@ def _share(old: float, new: float) -> str:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _union(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    return [*old, *(key for key in new if key not in old)]
 
 
 def _by_identity(items: Sequence[Any]) -> dict[str, Any]:

@@ -51,14 +51,11 @@ def failures(new: Output, limits: Tolerances | None = None) -> list[Move]:
 @pytest.mark.parametrize(
     ("path", "value", "by"),
     [
-        ("soil.n.value", 0.705, "+0.50 std"),
-        ("soil.n.std", 0.012, "+20 %"),
-        ("capability.over_slip.pull.1", 1470.0, "-0.50 std"),
-        ("traversability.probability", 0.91, "+0.010"),
-        ("chi2", 1.03, "+2 %"),
-        ("samples", 399, "-1"),
+        ("soil.n.value", 0.705, "+0.50 std"), ("soil.n.std", 0.012, "+20 %"),
+        ("capability.over_slip.pull.1", 1470.0, "-0.50 std"), ("traversability.probability", 0.91, "+0.010"),
+        ("chi2", 1.03, "+2 %"), ("samples", 399, "-1"),
     ],
-)
+)  # fmt: skip
 def test_a_moved_value_is_told_in_its_own_unit(path: str, value: Any, by: str) -> None:
     (move,) = failures(changed(path, value))
     assert (move.output, move.part, move.path, move.kind, move.new, move.by) == (
@@ -70,13 +67,10 @@ def test_a_moved_value_is_told_in_its_own_unit(path: str, value: Any, by: str) -
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("soil.n.value", 0.7001),
-        ("soil.n.std", 0.01002),
-        ("capability.over_slip.pull.1", 1500.9),
-        ("traversability.probability", 0.902),
-        ("chi2", 1.012),
+        ("soil.n.value", 0.7001), ("soil.n.std", 0.01002), ("capability.over_slip.pull.1", 1500.9),
+        ("traversability.probability", 0.902), ("chi2", 1.012),
     ],
-)
+)  # fmt: skip
 def test_a_small_move_passes_unless_nothing_may_move(path: str, value: Any) -> None:
     assert failures(changed(path, value)) == []
     assert [move.path for move in failures(changed(path, value), EXACT)] == [path]
@@ -85,18 +79,12 @@ def test_a_small_move_passes_unless_nothing_may_move(path: str, value: Any) -> N
 @pytest.mark.parametrize(
     ("path", "value", "kind"),
     [
-        ("status", "degraded", Kind.CHANGED),
-        ("reason", "new_soil", Kind.CHANGED),
-        ("slip.FR", 0.0, Kind.CHANGED),
-        ("slip.FL", None, Kind.CHANGED),
-        ("chi2", ..., Kind.GONE),
-        ("soil.n", ..., Kind.GONE),
-        ("traversability", ..., Kind.GONE),
+        ("status", "degraded", Kind.CHANGED), ("reason", "new_soil", Kind.CHANGED), ("slip.FR", 0.0, Kind.CHANGED),
+        ("slip.FL", None, Kind.CHANGED), ("rejected.stale", 3, Kind.CHANGED), ("slip.RL", 0.1, Kind.CHANGED),
+        ("chi2", ..., Kind.GONE), ("soil.n", ..., Kind.GONE), ("traversability", ..., Kind.GONE),
         ("capability.over_slip.pull.1", ..., Kind.GONE),
-        ("rejected.stale", 3, Kind.CHANGED),
-        ("slip.RL", 0.1, Kind.CHANGED),
     ],
-)
+)  # fmt: skip
 def test_a_change_of_what_is_said_is_told_whatever_the_tolerance(path: str, value: Any, kind: Kind) -> None:
     (move,) = failures(changed(path, value), Tolerances(1e9, 1e9, 1e9, 1e9))
     assert (move.part, move.path, move.kind) == ("1", path, kind)

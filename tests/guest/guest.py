@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
 """A guest kernel with vcan (Debian's User-Mode Linux): no KVM, an ordinary process.
 
-    guest.py setup [--debian]                            fetch the kernel, once; also a bare Debian
-    guest.py run [--rw DIR] [--unit FILE]... -- COMMAND  run COMMAND in it, vcan0 is up
+    guest.py setup [--debian]     fetch the kernel, once; also a bare Debian
 
-The guest sees this machine's files; what it writes is lost, except under --rw.
-With --unit it boots this machine's systemd as PID 1 (needs root) with these units.
+`run` runs a command in it, where vcan0 is up.  The guest sees this machine's files; what it writes is lost, except
+under `rw`.  With `units` it boots this machine's systemd as PID 1 (needs root) with these units.
 `run(base=bare_debian())` boots the systemd of a bare Debian instead, which has nothing of this machine.
 """
 
@@ -121,7 +120,6 @@ def run(
     units: Iterable[Path] = (),
     base: Path = Path("/"),
     timeout: float = 120.0,
-    capture: bool = True,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in the guest, in this working directory; its two outputs come as one.
 
@@ -148,7 +146,7 @@ def run(
             boot += SYSTEMD
         with (job / "console").open("wb") as console, (job / "output").open("wb") as captured:
             output = subprocess.Popen(  # through a pipe: the kernel makes its terminals non-blocking
-                ["cat"], stdin=subprocess.PIPE, stdout=captured if capture else None
+                ["cat"], stdin=subprocess.PIPE, stdout=captured
             )
             kernel = subprocess.Popen(
                 ["sh", "-c", GUARDED, "sh", cache / "linux.uml", f"mem={MEMORY}M", *boot, f"base={base}", f"job={job}",
@@ -191,26 +189,17 @@ def _memory_file() -> dict[str, str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("setup").add_argument("--debian", action="store_true")
-    job = verbs.add_parser("run")
-    job.add_argument("--rw", action="append", default=[], type=Path)
-    job.add_argument("--unit", action="append", default=[], type=Path)
-    job.add_argument("--timeout", type=float, default=120.0)
-    job.add_argument("command", nargs="+")
+    setup = parser.add_subparsers(dest="verb", required=True).add_parser("setup")
+    setup.add_argument("--debian", action="store_true")
     given = parser.parse_args()
     try:
-        if given.verb == "setup":
-            print(prepare())
-            if given.debian:
-                print(bare_debian())
-            return 0
-        done = run(given.command, rw=given.rw, units=given.unit, timeout=given.timeout, capture=False)
-        sys.stderr.write(done.stdout)
-        return done.returncode
+        print(prepare())
+        if given.debian:
+            print(bare_debian())
     except Unavailable as reason:
         print(reason, file=sys.stderr)
         return NO_STATUS
+    return 0
 
 
 if __name__ == "__main__":

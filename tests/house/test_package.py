@@ -62,6 +62,8 @@ def test_every_public_name_is_there_and_described(name: str) -> None:
     module = importlib.import_module(name)
     assert (module.__doc__ or "").strip()
     assert len(set(module.__all__)) == len(module.__all__) > 0
+    assert [n for n in module.__all__ if n.startswith("_") and n != "__version__"] == []
+    assert [n for n in module.__all__ if isinstance(getattr(module, n), ModuleType)] == []
     described = described_constants(module)
     for public in module.__all__:
         value = getattr(module, public)
@@ -75,24 +77,12 @@ def test_every_public_name_is_there_and_described(name: str) -> None:
             assert public in described, public
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_no_public_name_is_private_or_a_module(name: str) -> None:
-    module = importlib.import_module(name)
-    assert [n for n in module.__all__ if n.startswith("_") and n != "__version__"] == []
-    assert [n for n in module.__all__ if isinstance(getattr(module, n), ModuleType)] == []
-
-
 def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0
     assert capsys.readouterr().out == f"soilbus {soilbus.__version__}\n"
     assert re.fullmatch(r"\d+\.\d+\.\d+", soilbus.__version__)
-
-
-def test_the_bus_and_the_citation_have_the_same_version() -> None:
-    assert software_version() == tuple(int(part) for part in soilbus.__version__.split("."))
-    assert f"\nversion: {soilbus.__version__}\n" in (REPO / "CITATION.cff").read_text()
 
 
 def test_the_changelog_has_this_version_and_what_came_since() -> None:
@@ -112,6 +102,7 @@ def test_the_citation_parses_and_names_the_paper() -> None:
     assert {"cff-version", "message", "title", "authors"} <= cited.keys()  # what the format asks for
     assert (cited["cff-version"], cited["type"], cited["license"]) == ("1.2.0", "software", "Apache-2.0")
     assert cited["authors"] == [{"name": "the soilbus authors"}]
+    assert tuple(map(int, cited["version"].split("."))) == software_version()
     assert cited["version"] == soilbus.__version__
     (paper,) = cited["references"]
     assert {"type", "title", "authors"} <= paper.keys()
@@ -130,7 +121,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_wheel_has_the_types_the_version_and_its_own_requirements(built: Path) -> None:
+def test_wheel_and_sdist_have_the_types_the_version_and_their_requirements(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
     with zipfile.ZipFile(wheel) as package:
         names = set(package.namelist())
@@ -141,6 +132,10 @@ def test_the_wheel_has_the_types_the_version_and_its_own_requirements(built: Pat
     assert said["Version"] == soilbus.__version__
     needed = [text for text in said.get_all("Requires-Dist", []) if "extra ==" not in text]
     assert any(re.match(r"scipy\b", text) for text in needed)
+    (sdist,) = built.glob("*.tar.gz")
+    with tarfile.open(sdist) as package:
+        names = {name.partition("/")[2] for name in package.getnames()}
+    assert {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md", "service/soilbus/py.typed"} <= names
 
 
 def test_the_installed_wheel_prints_its_own_pages_and_has_their_pictures(built: Path, tmp_path: Path) -> None:
@@ -168,10 +163,3 @@ def test_the_installed_wheel_prints_its_own_pages_and_has_their_pictures(built: 
 def test_a_page_that_is_not_there_is_one_line_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs", "jsn"]) == 2
     assert capsys.readouterr().err == "soilbus: no page jsn; did you mean json?\n"
-
-
-def test_the_sdist_has_changelog_and_citation(built: Path) -> None:
-    (sdist,) = built.glob("*.tar.gz")
-    with tarfile.open(sdist) as package:
-        names = {name.partition("/")[2] for name in package.getnames()}
-    assert {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md", "service/soilbus/py.typed"} <= names

@@ -45,10 +45,7 @@ def test_no_tuning_value_and_no_private_name_is_imported(path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "fault"),
     [
-        (
-            "from soilbus.daemon.health import LONGEST_SOLVE, Health",
-            "soilbus.daemon.health.LONGEST_SOLVE is not in",
-        ),
+        ("from soilbus.daemon.health import LONGEST_SOLVE, Health", "soilbus.daemon.health.LONGEST_SOLVE is not in"),
         ("from soilbus.daemon.service import _kind as kind", "soilbus.daemon.service._kind is private"),
         ("def late():\n    from soilbus.can.bus import LATE", "soilbus.can.bus.LATE is not in its"),
         ("import soilbus._hidden", "soilbus._hidden._hidden is private"),

@@ -51,8 +51,6 @@ RECEIVED_MODULUS, WINDOW_MODULUS = 4016, 251
 """Values of the daemon's 12-bit count of received frames and of its 8-bit window number (dbc/soilbus.dbc)."""
 EDGE_LEAD = 0.005
 """Time [s] before the first sample at which the daemon's bins begin."""
-RECEIVE_BUFFER = 4 << 20
-"""Bytes of a kernel's buffer that hold seconds of frames."""
 FULL_BUS_RATE = 7350.0
 """Frames a second of 8 bytes with 29-bit identifiers that 1 Mbit/s carries, at 136 bits each with their stuff bits."""
 MAPPED_SHARE = 0.1
@@ -63,8 +61,8 @@ _POSITION = 0xFEF3
 _OTHERS_PERIOD = 0.01
 """Period [s] of each unmapped message."""
 _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
-MAX_PAUSE_SMALL_BUFFER = 0.05
-"""Longest time [s] between two looks where the kernel's buffer does not hold seconds of frames."""
+PAUSE = 0.05
+"""Time [s] between two looks of the ear: frames that the kernel's smallest buffer holds."""
 N_SYSTEM_CALLS = 1000
 """How often a system call is timed."""
 QUIET_TIME = 1.0
@@ -270,19 +268,12 @@ class Ear:
         while self._on:
             frame = self._wire.recv(0.0)
             if frame is None:
-                time.sleep(self._pause())
+                time.sleep(PAUSE)  # the kernel stamps frames, and listening takes the daemon time
                 continue
             if frame.arbitration_id in self._said:
                 self._said[frame.arbitration_id].append((frame.timestamp, bytes(frame.data)))
             else:
                 self._mapped.append(frame.timestamp)
-
-    def _pause(self) -> float:
-        """Time [s] for which frames may gather: the kernel stamps them, and listening takes the daemon time."""
-        if not self._mapped:
-            return MAX_PAUSE_SMALL_BUFFER
-        pause = until_middle(time.time(), self._mapped[0], self._config.estimator.window, self._config.estimator.hop)
-        return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, MAX_PAUSE_SMALL_BUFFER)
 
     def latencies(self) -> Array:
         """Time [s] from the last mapped frame of each window so far to its frame SoilStrength."""
@@ -321,11 +312,6 @@ def latencies(mapped: Array, results: Array, window: float, hop: float) -> Array
     end = mapped[0] - EDGE_LEAD + window + hop * number
     late[number] = results[:, 0] - mapped[np.searchsorted(mapped, end) - 1]
     return late
-
-
-def until_middle(now: float, first: float, window: float, hop: float) -> float:
-    """Time [s] from `now` to the next middle between two windows' ends, where `first` is the first mapped frame's."""
-    return (first - EDGE_LEAD + window + hop / 2.0 - now) % hop
 
 
 class Traffic:

@@ -7,8 +7,7 @@
 The reference tractor's simulated drive on loam goes through the service's own pipeline. The windows before the last
 are solved without a trace, so that caches are filled and the tracker follows its soil; the last one is solved under
 `sys.setprofile`, which reports every call of a Python function. The counts are a measure of how much a reader must
-follow, not of time. The service itself estimates and decides each hop, and watches for immobilisation at 10 Hz beside
-it; replay does both in one (`watched`).
+follow, not of time. They are of estimate and decision; the watch for immobilisation runs at 10 Hz beside.
 
     python -m tests.lab.hop_trace
 """
@@ -46,8 +45,8 @@ class HopTrace(NamedTuple):
     calls: int
 
 
-def hop_trace(warm_hops: int = WARM_HOPS, watched: bool = False) -> HopTrace:
-    """Counts of the hop after `warm_hops` of the reference tractor's drive, of its moments' watch too if `watched`.
+def hop_trace(warm_hops: int = WARM_HOPS) -> HopTrace:
+    """Counts of the hop after `warm_hops` of the reference tractor's drive.
 
     Raises RuntimeError where the drive is too short for that many windows.
     """
@@ -56,7 +55,7 @@ def hop_trace(warm_hops: int = WARM_HOPS, watched: bool = False) -> HopTrace:
     duration = settings.window + (warm_hops + 1) * settings.hop
     database = load_databases(config)
     pipeline = Pipeline(config, database)
-    solve = pipeline.estimator.solve if watched else pipeline.estimator.solve_unwatched
+    solve = pipeline.estimator.solve_unwatched
     solved, due = 0, 0.0
     for message in frames(simulate(config, excited("loam", duration), SEED), config, database):
         pipeline.feed(
@@ -91,10 +90,9 @@ def traced(solve: Callable[[WindowTask], object], task: WindowTask) -> HopTrace:
 
 
 def main() -> None:
-    """Print the counts without the watch and with it, a line each."""
-    for watched, title in ((False, "one hop"), (True, "with its watch it")):
-        found = hop_trace(watched=watched)
-        print(f"{title} enters {found.files} files, {found.functions} functions, {found.calls} calls of soilbus")
+    """Print the counts."""
+    found = hop_trace()
+    print(f"one hop enters {found.files} files, {found.functions} functions, {found.calls} calls of soilbus")
 
 
 if __name__ == "__main__":

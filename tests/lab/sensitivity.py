@@ -24,10 +24,11 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache, partial
 from inspect import getsource
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -160,14 +161,24 @@ def with_field(options: Any, path: Sequence[str], value: float) -> Any:
     return replace(options, **{first: with_field(getattr(options, first), rest, value) if rest else value})
 
 
-@dataclass(frozen=True)
-class Estimated:
-    """A window's result: status, [log pressure, tan phi, log n] and their sd, evaluations."""
+Figures = tuple[tuple[str, Callable[[Any, Any], float]], ...]
+"""What is compared of two results, before and after: how it is printed, and its number."""
 
-    status: str
-    value: Array
-    sd: Array
-    evaluations: int
+
+def change(figures: Figures, before: Any, after: Any) -> str:
+    """The figures that do not round to zero, as they are printed; empty where nothing moved."""
+    texts = [text.format(of(before, after)) for text, of in figures]
+    return ", ".join(text for text in texts if re.search("[1-9]", text))
+
+
+def differ(before: Sequence[Any], after: Sequence[Any]) -> int:
+    """How many of the values are others."""
+    return sum(a != b for a, b in zip(before, after, strict=True))
+
+
+def greatest(values: Any) -> float:
+    """The greatest of numbers, of which some are nan; 0 for none."""
+    return float(np.nanmax(np.asarray(values, float), initial=0.0))
 
 
 class Drive(NamedTuple):
@@ -216,51 +227,37 @@ def _drive(
     return Drive(config, list(windows(config, recording)))
 
 
-def estimates(options: EstimatorOptions) -> list[Estimated]:
-    """The result of every window of the drives."""
-    found = []
+def estimates(options: EstimatorOptions) -> SimpleNamespace:
+    """Of every window of the drives: status, [log pressure, tan phi, log n] and their sd; evaluations of all fits."""
+    status, value, sd, work = [], [], [], 0
     for config, data in drives():
         estimator = WindowEstimator(config, partial(_tracker, rig_of(config, options)))
         for i, (window, end) in enumerate(data):
             result = estimator.estimate(task_of(window, end, config, i)).result
-            posterior, nothing = result.posterior, np.full(3, np.nan)
-            if posterior is None:
-                found.append(Estimated(result.status, nothing, nothing, result.iterations))
+            status.append(result.status)
+            work += result.iterations
+            if (posterior := result.posterior) is None:
+                value.append([math.nan] * 3)
+                sd.append([math.nan] * 3)
                 continue
             pressure = posterior.bearing_pressure(config.estimator.z_ref, config.estimator.b_ref)
             n, tan_phi = PARAMETERS.index("n"), posterior.tan_phi()
-            value = np.array([math.log(pressure.value), tan_phi.value, math.log(posterior.soil.n)])
-            sd = np.array([pressure.std / pressure.value, tan_phi.std, math.sqrt(posterior.log_covariance[n, n])])
-            found.append(Estimated(result.status, value, sd, result.iterations))
-    return found
+            value.append([math.log(pressure.value), tan_phi.value, math.log(posterior.soil.n)])
+            sd.append([pressure.std / pressure.value, tan_phi.std, math.sqrt(posterior.log_covariance[n, n])])
+    return SimpleNamespace(status=status, value=np.array(value), sd=np.array(sd), work=work)
+
+
+OF_ESTIMATES: Figures = (
+    ("{:.2f} sd", lambda a, b: greatest(np.abs(b.value - a.value) / a.sd)),
+    ("sd {:.0f} %", lambda a, b: 100.0 * greatest(np.abs(np.log(b.sd / a.sd)))),
+    ("{} status", lambda a, b: differ(a.status, b.status)),
+    ("work {:+.0f} %", lambda a, b: 100.0 * (b.work / a.work - 1.0)),
+)
 
 
 def _tracker(rig: Rig, _: Rig, *further: Any) -> Tracker:
     """A tracker of a rig with other options in place of the configured one."""
     return Tracker(rig, *further)
-
-
-def change_of_estimates(before: Sequence[Estimated], after: Sequence[Estimated]) -> str:
-    """What moved, in a few words; empty where nothing did."""
-    pairs = list(zip(before, after, strict=True))
-    off = max(float(np.nanmax(np.abs(b.value - a.value) / a.sd, initial=0.0)) for a, b in pairs)
-    wider = max(float(np.nanmax(np.abs(np.log(b.sd / a.sd)), initial=0.0)) for a, b in pairs)
-    status = sum(a.status != b.status for a, b in pairs)
-    work = sum(b.evaluations for _, b in pairs) / sum(a.evaluations for a, _ in pairs) - 1.0
-    return _words(
-        (off, "{:.2f} sd"), (100.0 * wider, "sd {:.0f} %"), (status, "{} status"), (100.0 * work, "work {:+.0f} %")
-    )
-
-
-@dataclass(frozen=True)
-class Diagnosed:
-    """A case's diagnosis: verdict, probability by name, log pressure and its sd, model evaluations [instants]."""
-
-    verdict: str
-    names: Mapping[str, float]
-    pressure: float
-    sd: float
-    work: int
 
 
 class Recorded(NamedTuple):
@@ -294,36 +291,38 @@ def _recorded(name: str) -> Recorded:
     return Recorded(case, found, store.rig, prior_of(case.config), tuple(effects))
 
 
-def diagnoses(options: DiagnosisOptions) -> list[Diagnosed]:
-    """The diagnosis of every case."""
-    return [_diagnosed(one, options) for one in recorded()]
-
-
-def _diagnosed(one: Recorded, options: DiagnosisOptions) -> Diagnosed:
-    try:
-        records = one.records(options)
-        found = diagnose(records, one.prior, list(one.effects))
-    except (NotFitted, TooLittle, np.linalg.LinAlgError):
-        return Diagnosed("failed", {}, math.nan, math.nan, 0)
-    settings = one.case.config.estimator
-    pressure = found.soil_after(0).bearing_pressure(settings.z_ref, settings.b_ref)
-    names = {addition.effect.name: addition.probability for addition in found.additions}
-    work = sum(record.training.work.instants for record in records)
-    return Diagnosed(found.verdict, names, math.log(pressure.value), pressure.std / pressure.value, work)
-
-
-def change_of_diagnoses(before: Sequence[Diagnosed], after: Sequence[Diagnosed]) -> str:
-    """What moved, in a few words; empty where nothing did."""
-    pairs = list(zip(before, after, strict=True))
-    verdicts = sum(a.verdict != b.verdict for a, b in pairs)
-    names = sum(set(a.names) != set(b.names) for a, b in pairs)
-    chance = max((abs(a.names[n] - b.names[n]) for a, b in pairs for n in a.names if n in b.names), default=0.0)
-    off = float(np.nanmax([abs(b.pressure - a.pressure) / a.sd for a, b in pairs]))
-    work = sum(b.work for _, b in pairs) / sum(a.work for a, _ in pairs) - 1.0
-    return _words(
-        (verdicts, "{} verdict"), (names, "{} names"), (chance, "p {:.2f}"), (off, "{:.2f} sd"),
-        (100.0 * work, "work {:+.0f} %"),
+def diagnoses(options: DiagnosisOptions) -> SimpleNamespace:
+    """Of every case: verdict, probability by name, log pressure and its sd; model evaluations [instants] of all."""
+    found: list[tuple[str, dict[str, float], float, float]] = []
+    work = 0
+    for one in recorded():
+        try:
+            records = one.records(options)
+            told = diagnose(records, one.prior, list(one.effects))
+        except (NotFitted, TooLittle, np.linalg.LinAlgError):
+            found.append(("failed", {}, math.nan, math.nan))
+            continue
+        settings = one.case.config.estimator
+        pressure = told.soil_after(0).bearing_pressure(settings.z_ref, settings.b_ref)
+        names = {addition.effect.name: addition.probability for addition in told.additions}
+        work += sum(record.training.work.instants for record in records)
+        found.append((str(told.verdict), names, math.log(pressure.value), pressure.std / pressure.value))
+    verdicts, chances, pressures, sds = zip(*found, strict=True)
+    return SimpleNamespace(
+        verdicts=verdicts, names=[set(of) for of in chances], chances=chances, pressure=np.array(pressures),
+        sd=np.array(sds), work=work,
     )  # fmt: skip
+
+
+OF_DIAGNOSES: Figures = (
+    ("{} verdict", lambda a, b: differ(a.verdicts, b.verdicts)),
+    ("{} names", lambda a, b: differ(a.names, b.names)),
+    ("p {:.2f}", lambda a, b: greatest([
+        abs(old[n] - new[n]) for old, new in zip(a.chances, b.chances, strict=True) for n in old.keys() & new.keys()
+    ])),
+    ("{:.2f} sd", lambda a, b: greatest(np.abs(b.pressure - a.pressure) / a.sd)),
+    ("work {:+.0f} %", lambda a, b: 100.0 * (b.work / a.work - 1.0)),
+)  # fmt: skip
 
 
 @cache
@@ -345,13 +344,15 @@ def watches(options: WatchOptions) -> list[WarningTrial]:
     return [judged(kind, observation, options) for kind, observation in boggings()]
 
 
-def change_of_watches(before: Sequence[WarningTrial], after: Sequence[WarningTrial]) -> str:
-    """What moved, in a few words; empty where nothing did."""
-    in_time = sum(b.in_time for b in after) - sum(a.in_time for a in before)
-    lead = max((abs(b.lead - a.lead) for a, b in zip(before, after, strict=True) if math.isfinite(a.lead)), default=0.0)
-    firm = [(a, b) for a, b in zip(before, after, strict=True) if a.kind in FIRM_KINDS]
-    false = sum(b.warnings - a.warnings for a, b in firm)
-    return _words((in_time, "{:+d} in time"), (lead, "{:.1f} s"), (false, "{:+d} false"))
+OF_WATCHES: Figures = (
+    ("{:+d} in time", lambda a, b: sum(one.in_time for one in b) - sum(one.in_time for one in a)),
+    ("{:.1f} s", lambda a, b: greatest([abs(new.lead - old.lead) for old, new in zip(a, b, strict=True)])),
+    ("{:+d} false", lambda a, b: _false(b) - _false(a)),
+)
+
+
+def _false(trials: Sequence[WarningTrial]) -> int:
+    return sum(one.warnings for one in trials if one.kind in FIRM_KINDS)
 
 
 SILENCES: Mapping[str, tuple[tuple[float, float], ...]] = {
@@ -362,18 +363,6 @@ SILENCES: Mapping[str, tuple[tuple[float, float], ...]] = {
 SPIKES, SPIKE_SD = 0.01, (4.0, 16.0)
 """Share [1] of the samples that are spikes, and their sizes [sd of the sensor]: a factor of about two on both sides of
 the limits of 6.5 and 8 sd, so that these decide."""
-
-
-class Heard(NamedTuple):
-    """What the intake makes of a drive: samples refused, whether each window has data enough, torque limits, moments'
-    slips and positions at the windows' ends, and the bin length of the whole drive."""
-
-    refused: int
-    enough: Array
-    limit: Array
-    slip: Array
-    position: Array
-    bin_length: float
 
 
 @cache
@@ -399,15 +388,15 @@ def heard_drives() -> tuple[tuple[Config, Mapping[str, Column]], ...]:
     return tuple((config, channels) for channels in (smooth, shaking, spiked, silent))
 
 
-def receptions(options: ReceptionOptions) -> list[Heard]:
-    """What the intake makes of every drive."""
+def receptions(options: ReceptionOptions) -> list[SimpleNamespace]:
+    """What the intake makes of every drive: samples refused, whether each window has data enough, torque limits,
+    moments' slips and positions at the windows' ends, and the bin length of the whole drive."""
     return [_heard(config, channels, options) for config, channels in heard_drives()]
 
 
-def _heard(config: Config, channels: Mapping[str, Column], options: ReceptionOptions) -> Heard:
+def _heard(config: Config, channels: Mapping[str, Column], options: ReceptionOptions) -> SimpleNamespace:
     intake = Intake(config, load_databases(config), options=options)
-    enough: list[bool] = []
-    limit, slip, position = [], [], []
+    enough, limit, slip, position = [], [], [], []
     for now in np.arange(config.estimator.hop, 90.0, config.estimator.hop).tolist():
         intake.add(_decoded(channels, now - config.estimator.hop, now))
         for task in intake.due(now):
@@ -419,8 +408,9 @@ def _heard(config: Config, channels: Mapping[str, Column], options: ReceptionOpt
     whole.add(_decoded(channels, 0.0, 20.0))
     window = whole.taken_whole()
     length = math.nan if window is None else float(window.t[1] - window.t[0])
-    return Heard(
-        intake.refusals.refused, np.array(enough), np.array(limit), np.array(slip), np.array(position), length
+    return SimpleNamespace(
+        refused=intake.refusals.refused, enough=sum(enough), limit=np.array(limit), slip=np.array(slip),
+        position=np.array(position), length=length,
     )  # fmt: skip
 
 
@@ -429,31 +419,24 @@ def _decoded(channels: Mapping[str, Column], begin: float, end: float) -> Decode
     return Decoded({name: Column(c.t[parts[name]], c.value[parts[name]]) for name, c in channels.items()})
 
 
-def change_of_receptions(before: Sequence[Heard], after: Sequence[Heard]) -> str:
-    """What moved, in a few words; empty where nothing did."""
-    pairs = list(zip(before, after, strict=True))
-    more = [b.refused - a.refused for a, b in pairs]
-    enough = sum(int(b.enough.sum() - a.enough.sum()) for a, b in pairs)
-    limits = sum(int((a.limit != b.limit).any(axis=1).sum()) for a, b in pairs)
-    bins = max((b.bin_length / a.bin_length - 1.0 for a, b in pairs), key=abs)
-    slip = max(float(np.nanmax(np.abs(a.slip - b.slip), initial=0.0)) for a, b in pairs)
-    position = EARTH_RADIUS * max(float(np.nanmax(np.abs(a.position - b.position), initial=0.0)) for a, b in pairs)
-    return _words(
-        (more[2] - more[1], "{:+d} found"), (more[0] + more[1], "{:+d} false"), (enough, "{:+d} enough"),
-        (100.0 * bins, "bins {:+.0f} %"), (limits, "{} limits"), (slip, "slip {:.2f}"), (position, "{:.1f} m"),
-    )  # fmt: skip
+def each(name: str) -> Callable[[Any, Any], Any]:
+    """Of each drive, how much more a figure is than before."""
+    return lambda a, b: [getattr(new, name) - getattr(old, name) for old, new in zip(a, b, strict=True)]
 
 
-class Contradiction(NamedTuple):
-    """The channels that are named in a window, and the one with a fault, if any."""
-
-    fault: str
-    named: tuple[str, ...]
-
-    @property
-    def is_false(self) -> bool:
-        """Whether a sound channel is named."""
-        return any(name != self.fault for name in self.named)
+OF_RECEPTIONS: Figures = (
+    ("{:+d} found", lambda a, b: each("refused")(a, b)[2] - each("refused")(a, b)[1]),
+    ("{:+d} false", lambda a, b: sum(each("refused")(a, b)[:2])),
+    ("{:+d} enough", lambda a, b: sum(each("enough")(a, b))),
+    ("bins {:+.0f} %", lambda a, b: 100.0 * max(
+        (new.length / old.length - 1.0 for old, new in zip(a, b, strict=True)), key=abs
+    )),
+    ("{} limits", lambda a, b: sum(
+        int((old.limit != new.limit).any(axis=1).sum()) for old, new in zip(a, b, strict=True)
+    )),
+    ("slip {:.2f}", lambda a, b: max(greatest(np.abs(more)) for more in each("slip")(a, b))),
+    ("{:.1f} m", lambda a, b: EARTH_RADIUS * max(greatest(np.abs(more)) for more in each("position")(a, b))),
+)  # fmt: skip
 
 
 @cache
@@ -481,49 +464,47 @@ def faulty_windows() -> tuple[tuple[str, Window, Array], ...]:
     return tuple(found)
 
 
-def contradictions(options: ConsistencyOptions) -> list[Contradiction]:
-    """What is named in each window."""
+def contradictions(options: ConsistencyOptions) -> SimpleNamespace:
+    """Of each window: whether the channel with a fault is named, and whether a sound one is."""
     config = reference_configuration()
     rig = rig_of(config)
-    return [
-        Contradiction(fault, implausible(window, rig, config.estimator, {}, motor, options))
+    named = [
+        (fault, implausible(window, rig, config.estimator, {}, motor, options))
         for fault, window, motor in faulty_windows()
     ]
+    return SimpleNamespace(
+        found=sum(fault in names for fault, names in named),
+        false=sum(bool({*names} - {fault}) for fault, names in named),
+    )
 
 
-def change_of_contradictions(before: Sequence[Contradiction], after: Sequence[Contradiction]) -> str:
-    """What moved, in a few words; empty where nothing did."""
-    found = sum(one.fault in one.named for one in after) - sum(one.fault in one.named for one in before)
-    false = sum(one.is_false for one in after) - sum(one.is_false for one in before)
-    return _words((found, "{:+d} found"), (false, "{:+d} false"))
+OF_CONTRADICTIONS: Figures = (
+    ("{:+d} found", lambda a, b: b.found - a.found),
+    ("{:+d} false", lambda a, b: b.false - a.false),
+)
 
 
-def _words(*figures: tuple[float, str]) -> str:
-    """The figures that do not round to zero, as they are printed."""
-    texts = [text.format(value) for value, text in figures]
-    return ", ".join(text for text in texts if re.search("[1-9]", text))
-
-
-def rows(
-    name: str, options: Any, run: Callable[[Any], Any], change: Callable[[Any, Any], str], only: str
-) -> Iterator[str]:
+def rows(name: str, options: Any, run: Callable[[Any], Any], figures: Figures, only: str) -> Iterator[str]:
     """Lines of the table, one for each field with `only` in its path."""
     before = run(options)
     for field in fields_of(options):
         path = ".".join(field.path)
         if only in f"{name}.{path}":
-            effects = [change(before, run(with_field(options, field.path, field.varied(factor)))) for factor in FACTORS]
-            yield f"| `{path}` | {field.value:g} | {field.unit} | {effects[0]} | {effects[1]} |"
+            less, more = (
+                change(figures, before, run(with_field(options, field.path, field.varied(factor))))
+                for factor in FACTORS
+            )
+            yield f"| `{path}` | {field.value:g} | {field.unit} | {less} | {more} |"
 
 
-TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Callable[[Any, Any], str]], ...] = (
-    ("estimator", EstimatorOptions(), estimates, change_of_estimates),
-    ("diagnosis", DiagnosisOptions(), diagnoses, change_of_diagnoses),
-    ("watch", WatchOptions(), watches, change_of_watches),
-    ("reception", ReceptionOptions(), receptions, change_of_receptions),
-    ("consistency", ConsistencyOptions(), contradictions, change_of_contradictions),
+TABLES: tuple[tuple[str, Any, Callable[[Any], Any], Figures], ...] = (
+    ("estimator", EstimatorOptions(), estimates, OF_ESTIMATES),
+    ("diagnosis", DiagnosisOptions(), diagnoses, OF_DIAGNOSES),
+    ("watch", WatchOptions(), watches, OF_WATCHES),
+    ("reception", ReceptionOptions(), receptions, OF_RECEPTIONS),
+    ("consistency", ConsistencyOptions(), contradictions, OF_CONTRADICTIONS),
 )
-"""Name, options, what they are tried on, and how two results are compared."""
+"""Name, options, what they are tried on, and what is compared of two results."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -535,12 +516,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.only and chosen.page is not None:
         parser.error("--page needs the tables of all fields: leave out --only")
     lines: list[str] = []
-    for name, options, run, change in TABLES:
+    for name, options, run, figures in TABLES:
         if not any(chosen.only in f"{name}.{'.'.join(field.path)}" for field in fields_of(options)):
             continue
         began = time.process_time()
         lines += ["", f"## {name.capitalize()}", "", HEAD, "| - | - | - | - | - |"]
-        for line in rows(name, options, run, change, chosen.only):
+        for line in rows(name, options, run, figures, chosen.only):
             print(line, flush=True)
             lines.append(line)
         print(f"{name}: {time.process_time() - began:.0f} s of processor time", flush=True)

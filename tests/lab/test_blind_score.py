@@ -10,8 +10,9 @@ import pytest
 from soilbus.simulator.scenario import Patch
 from soilbus.terra.soils import soil_named
 from tests.golden.outputs import the_case
-from tests.lab.blind import command
+from tests.lab.blind import __main__ as command
 from tests.lab.blind import trial as trials
+from tests.lab.blind.calibration import curve, draw, stated
 from tests.lab.blind.cases import Case
 from tests.lab.blind.form import Hidden, Setting, by_hooks
 from tests.lab.blind.table import figures, report, targets_are_met
@@ -126,3 +127,27 @@ def test_a_diagnosis_that_fails_is_a_trial(monkeypatch):
     found = tried(shorter(the_case("single/torque_lag:averaged/medium/"), 30.0))
     assert (found.verdict, found.named) == ("failed", ())
     assert found.visible > 0.0
+
+
+# --- how often names are right ---
+
+
+def test_names_of_all_sets_count_but_those_beside_unknown(tmp_path):
+    trials = [
+        a_trial(sets=({"lugs": 0.9, "grade": 0.05}, {"inertia": 0.85})),
+        a_trial(verdict="unknown", sets=({"lugs": 0.9},), hidden=()),
+        a_trial(verdict="none", sets=()),
+    ]
+    assert sorted(stated(trials)) == [(0.05, False), (0.85, False), (0.9, True)]
+    draw(curve(stated(trials)), str(tmp_path / "curve.svg"))
+    assert (tmp_path / "curve.svg").read_text().startswith("<?xml")
+
+
+def test_names_that_are_right_as_often_as_stated_lie_on_the_diagonal():
+    rng = np.random.default_rng(4)
+    probabilities = rng.uniform(0.02, 1.0, 20000)
+    found = curve(zip(probabilities.tolist(), (rng.uniform(size=20000) < probabilities).tolist(), strict=True))
+    assert sum(one.names for one in found) == 20000
+    for one in found:
+        assert one.right / one.names == pytest.approx(one.stated, abs=4.0 * np.sqrt(0.25 / one.names))
+        assert one.low < one.right / one.names < one.high

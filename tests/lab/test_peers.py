@@ -11,10 +11,10 @@ from scipy.integrate import quad
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
-from tests.lab.peers import finite_differences, kalman, linear, newton_raphson, ours
-from tests.lab.peers.compare import compared, comparison, ours_is_ahead, verdict
-from tests.lab.peers.roster import OURS, Entry, roster
-from tests.lab.peers.scores import Duel, Score, duel, truth
+from soilbus.trials.bench.window import by_finite_differences
+from tests.lab.peers import kalman, linear, newton_raphson
+from tests.lab.peers.compare import Score, compared, comparison, duels, ours_is_ahead, truth
+from tests.lab.peers.roster import OURS, Entry, least_squares, ours, roster
 from tests.lab.peers.windows import simulated_case
 
 NAMES = ("loam", "wet_clay", "dry_sand")
@@ -35,12 +35,12 @@ def quiet():
 @pytest.fixture(scope="module")
 def entries():
     """The roster without those that have tests of their own: least_squares (slow, our optimum)."""
-    return [entry for entry in roster() if entry.method is not finite_differences.estimate]
+    return [entry for entry in roster() if entry.method is not least_squares]
 
 
 @pytest.fixture(scope="module")
 def scores(entries):
-    return compared(entries, NAMES, windows=2, seed=0, step=lambda: None)
+    return compared(entries, NAMES, windows=2, seed=0)
 
 
 def test_linear_recovers_c_and_phi_from_triangular_stresses():
@@ -94,7 +94,7 @@ def test_least_squares_finds_our_optimum_and_our_covariance():
     # A check of our derivatives, weights and steps as much as of the peer.
     whole = simulated_case(SOILS["wet_clay"], 7)
     case = dataclasses.replace(whole, problem=whole.problem.thinned(20))
-    mine, its = fit_window(case.problem, case.prior).mode.posterior, finite_differences.fit(case)
+    mine, its = fit_window(case.problem, case.prior).mode.posterior, by_finite_differences(case.problem, case.prior)
     std = np.sqrt(np.diag(its.log_covariance))
     assert np.abs(np.log(np.asarray(mine.soil) / np.asarray(its.soil)) / std).max() < 0.02
     scaled = (mine.log_covariance - its.log_covariance) / np.outer(std, std)
@@ -105,27 +105,18 @@ def test_least_squares_finds_our_optimum_and_our_covariance():
 def test_ours_recovers_the_truth_from_exact_readings(name, quiet):
     # Unknown gains and the prior leave room, so in its own standard deviations.
     case = quiet[name].knowing(("c", "K"))
-    answer = ours.estimate(case)
+    answer = ours(case)
     for quantity in ("bearing", "phi", "n"):
         assert abs(answer[quantity].value - truth(case.soil, quantity)) < answer[quantity].std
 
 
-def rms(scores, entry, quantity) -> float:
-    """Over the windows of all soils; a failure counts as being off by everything."""
-    return float(np.sqrt(np.mean(np.nan_to_num(scores[entry].errors(quantity), nan=1.0) ** 2)))
-
-
 def test_ours_is_closer_than_every_peer_on_noisy_windows(scores, entries):
     # All soils together.
-    mine = {e.exact: e for e in entries if e.name == OURS}
-    compared_ = 0
-    for peer in entries:
-        if peer.name == OURS:
-            continue
-        for quantity in scores[peer].quantities:
-            assert rms(scores, mine[peer.exact], quantity) < rms(scores, peer, quantity), (peer, quantity)
-            compared_ += 1
-    assert compared_ == 2 * 2 + 2 * 3 + 2 * 3
+    found = list(duels(scores))
+    assert [(peer.name, quantity) for peer, quantity, ours_is_closer in found if not ours_is_closer] == []
+    assert len(found) == 2 * 2 + 2 * 3 + 2 * 3
+    assert ours_is_ahead(scores)
+    assert len(comparison(scores).splitlines()) >= len(entries)
 
 
 def test_ours_never_fails_and_covers_the_truth(scores, entries):
@@ -135,41 +126,15 @@ def test_ours_never_fails_and_covers_the_truth(scores, entries):
     assert np.mean(covered) > 0.8  # 30 intervals of six windows
 
 
-def answers_of(*values: float, std: float = np.nan) -> list:
-    return [{"phi": Estimate(v * LOAM.phi, std * LOAM.phi)} for v in values]
+def test_a_peer_that_is_closer_or_a_failure_of_ours_is_said_to_be():
+    soil, off_by = SOILS["loam"], np.linspace(0.05, 0.10, 12)
 
+    def score_of(values) -> Score:
+        answers = [None if np.isnan(v) else {"phi": Estimate(v * soil.phi, np.nan)} for v in values]
+        return Score([soil] * len(answers), answers, [0.001] * len(answers))
 
-LOAM = SOILS["loam"]
-
-
-def score_of(answers: list, seconds: float) -> Score:
-    return Score([LOAM] * len(answers), answers, [seconds] * len(answers))
-
-
-def test_a_peer_that_is_closer_is_said_to_be():
-    off_by = np.linspace(0.05, 0.10, 12)
-    good, bad = score_of(answers_of(*(1.0 + off_by / 2.0)), 0.001), score_of(answers_of(*(1.0 - off_by)), 0.002)
-    won = duel(good, bad, "phi")
-    assert (won.closer, won.closer_in, won.windows) == ("peer", 12, 12)
-    assert won.peer == pytest.approx(won.ours / 2.0)
-    assert duel(bad, good, "phi").closer == "ours"
-    one = duel(score_of([*answers_of(1.0), *[None] * 11], 0.001), bad, "phi")
-    assert (one.closer_in, one.windows) == (1, 12)
-    mine, peer = Entry(OURS, ours.estimate), Entry("a peer", ours.estimate, note="something")
-    assert verdict({mine: bad, peer: good}).startswith("Of 1 comparisons ours is closer in 0, a peer in 1;")
-    assert "3.8 / 3.7 peer" in comparison({mine: bad, peer: good})
-    assert "7.7 / 7.5 ours" in comparison({mine: good, peer: bad})
-    failing = score_of([*answers_of(*(1.0 + off_by[1:] / 2.0)), None], 0.001)
+    good, bad, failing = (score_of(v) for v in (1.0 + off_by / 2.0, 1.0 - off_by, [*(1.0 + off_by[1:] / 9.0), np.nan]))
+    assert good.rms("phi") == pytest.approx(bad.rms("phi") / 2.0)
+    mine, peer = Entry(OURS, ours), Entry("a peer", ours, note="something")
     ahead = [ours_is_ahead({mine: m, peer: p}) for m, p in ((bad, good), (good, bad), (failing, bad), (good, good))]
     assert ahead == [False, True, False, False]
-
-
-@pytest.mark.parametrize(
-    ("peer", "mine", "closer_in", "windows", "closer"),
-    [
-        (1.0, 1.01, 12, 12, "alike"), (1.0, 2.0, 6, 6, "peer"), (2.0, 1.0, 0, 6, "ours"),
-        (1.0, 2.0, 5, 5, "open"), (1.0, 2.0, 10, 20, "open"), (1.0, 2.0, 0, 20, "open"),
-    ],
-)  # fmt: skip
-def test_only_what_windows_confirm_is_decided(peer, mine, closer_in, windows, closer):
-    assert Duel(peer, mine, closer_in, windows).closer == closer

@@ -14,13 +14,7 @@ from soilbus.sensors.options import ConsistencyOptions, ReceptionOptions
 from tests.lab.sensitivity import Field, fields_of, with_field
 
 PAGE = Path(__file__).resolve().parents[2] / "service" / "docs" / "sensitivity.md"
-OPTIONS = (
-    EstimatorOptions(),
-    DiagnosisOptions(),
-    WatchOptions(),
-    ReceptionOptions(),
-    ConsistencyOptions(),
-)
+OPTIONS = (EstimatorOptions(), DiagnosisOptions(), WatchOptions(), ReceptionOptions(), ConsistencyOptions())
 FIELDS = [(options, field) for options in OPTIONS for field in fields_of(options)]
 
 

@@ -71,8 +71,7 @@ def with_the_verdict_of_the_run_before(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "mutation",
-    [without_stale_check, without_memory_of_epochs, with_any_status, with_the_verdict_of_the_run_before],
+    "mutation", [without_stale_check, without_memory_of_epochs, with_any_status, with_the_verdict_of_the_run_before]
 )
 def test_a_service_without_a_check_is_found_out(mutation, monkeypatch):
     mutation(monkeypatch)

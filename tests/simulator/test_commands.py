@@ -46,15 +46,6 @@ def balance_miss(columns) -> np.ndarray:
     return (pull - along - columns["draft"]) / (MASS * GRAVITY)
 
 
-def test_a_drive_in_steps_is_the_drive_at_once():
-    whole, parts = drive(CONFIG, demo(8.0), 3).columns, joined(list(steps(CONFIG, demo(8.0), 3, step=0.06))).columns
-    for name, column in whole.items():
-        if column.dtype.kind == "f":
-            assert parts[name] == pytest.approx(column, rel=1e-7, abs=1e-9, nan_ok=True), name
-        else:
-            assert (parts[name] == column).all(), name
-
-
 def test_frames_in_steps_are_the_frames_at_once():
     """Up to noise that refers to a mean over a window, whose later half a step does not know."""
     noise = {name: {"of_mean": 0.0, "absolute": 1.0} for name in ("torque", "load", "draft")}

@@ -3,12 +3,11 @@
 import csv
 import math
 import re
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
+from adaptive import adaptive_forces
 from soilbus.cli.main import main
 from soilbus.config.file import MACHINES, load_config, parse_config
 from soilbus.simulator.drive import SimulationError, drive
@@ -16,6 +15,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
+from soilbus.terra.wheel import WheelModel, state_on
 
 FOLDER = MACHINES
 GRAVITY = 9.80665
@@ -107,27 +107,6 @@ def test_pull_and_loads_balance_on_every_machine(driven):
     assert total(columns, "load", ("FL", "FR")) * vehicle.wheelbase == pytest.approx(front, rel=1e-9)
 
 
-def forces_by_quad(soil, radius, width, entry, slip):
-    """Load, drawbar pull and torque of a rigid wheel (Wong & Reece), greatest stress at half the entry angle."""
-
-    def sigma(a):
-        a = max(a, entry - a)
-        return (soil.k_c / width + soil.k_phi) * (radius * (math.cos(a) - math.cos(entry))) ** soil.n
-
-    def tau(a):
-        j = radius * (entry - a - (1.0 - slip) * (math.sin(entry) - math.sin(a)))
-        return math.copysign(-math.expm1(-abs(j) / soil.K), j) * (soil.c + sigma(a) * math.tan(soil.phi))
-
-    def integral(f):
-        parts = np.linspace(0.0, entry, 9)
-        return sum(quad(f, a, b, epsabs=0.0, epsrel=1e-9, limit=400)[0] for a, b in pairwise(parts))
-
-    area = radius * width
-    load = area * integral(lambda a: sigma(a) * math.cos(a) + tau(a) * math.sin(a))
-    pull = area * integral(lambda a: tau(a) * math.cos(a) - sigma(a) * math.sin(a))
-    return load, pull, area * radius * integral(tau)
-
-
 def test_a_free_wheel_skids_without_torque_and_resists(driven):
     config, columns = driven
     free = [wheel for wheel in config.wheel if not wheel.driven]
@@ -138,7 +117,8 @@ def test_a_free_wheel_skids_without_torque_and_resists(driven):
         assert columns[f"drawbar_pull.{wheel.name}"].max() < 0.0
         for i in (3, 400, 900):
             angle, slip = columns[f"entry_angle.{wheel.name}"][i], columns[f"slip.{wheel.name}"][i]
-            load, pull, torque = forces_by_quad(soil_named("loam"), wheel.radius, wheel.width, angle, slip)
+            state = state_on(soil_named("loam"), angle, slip, wheel.radius, wheel.width)
+            load, pull, torque = adaptive_forces(state, WheelModel())
             assert load == pytest.approx(columns[f"load.{wheel.name}"][i], rel=1e-4)
             assert pull == pytest.approx(columns[f"drawbar_pull.{wheel.name}"][i], abs=1e-4 * load)
             assert torque == pytest.approx(0.0, abs=1e-4 * load)

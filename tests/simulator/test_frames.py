@@ -1,13 +1,11 @@
 """Frames carry the sensor series within their resolution, through logs of every format."""
 
-import can
 import cantools
 import numpy as np
 import pytest
 
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases
-from soilbus.can.log_writer import write_log
 from soilbus.can.mapping import channels_of
 from soilbus.config.file import load_config, parse_config
 from soilbus.simulator.frames import START_TIME, encoded, frames
@@ -96,33 +94,6 @@ def test_what_is_not_known_is_not_available():
     group = by_name(frames(short, unlimited))["MotorFL"]
     limits = {str(DATABASE.decode_message(m.arbitration_id, m.data)["TorqueLimit"]) for m in group}
     assert limits == {"not_available"}
-
-
-@pytest.mark.parametrize("suffix", [".log", ".log.gz", ".asc", ".blf"])
-def test_logs_read_back_as_written(messages, tmp_path, suffix):
-    path = tmp_path / f"drive{suffix}"
-    write_log(iter(messages[:2000]), path)
-    with can.LogReader(path) as log:
-        back = list(log)
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]
-    assert [(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in back] == [
-        (m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in messages[:2000]
-    ]
-    shift = back[0].timestamp - messages[0].timestamp if suffix == ".asc" else 0.0  # .asc keeps whole seconds only
-    times = np.array([m.timestamp - messages[0].timestamp for m in back]) - shift
-    assert times == pytest.approx([m.timestamp - messages[0].timestamp for m in messages[:2000]], abs=1.1e-6)
-
-
-def test_a_log_that_fails_midway_leaves_nothing(messages, tmp_path):
-    def breaking():
-        yield from messages[:10]
-        raise RuntimeError("the disk is gone")
-
-    with pytest.raises(RuntimeError):
-        write_log(breaking(), tmp_path / "drive.log")
-    with pytest.raises(ValueError, match="xyz"):
-        write_log(iter(messages[:10]), tmp_path / "drive.xyz")
-    assert list(tmp_path.iterdir()) == []
 
 
 FOREIGN = """VERSION ""

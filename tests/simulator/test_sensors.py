@@ -81,10 +81,6 @@ def test_noise_of_the_mean_follows_the_window_not_the_sample():
     assert sd[4000] == pytest.approx(5.0)
 
 
-def test_the_torque_limit_is_told_exactly(recording):
-    assert np.all(recording.channels["torque_limit.FL"].value == 2400.0)
-
-
 def test_a_channel_does_not_change_when_another_is_not_fitted(recording):
     raw = CONFIG.model_dump(exclude={"folder"}, exclude_none=True)
     for wheel in raw["wheel"]:

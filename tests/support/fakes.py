@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from typing import Any
 
 import can
@@ -21,11 +22,14 @@ from soilbus.offline.played_bus import InlineExecutor, PlayedClock
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
+from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
-__all__ = ["Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "ScriptedBus", "drive_messages", "feed_message"]
+__all__ = [
+    "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "feed_message",
+    "in_reverse",
+]  # fmt: skip
 
 FakeClock = PlayedClock
 
@@ -35,11 +39,29 @@ def drive_messages(config: Config, seconds: float) -> list[can.Message]:
     return list(frames(simulate(config, excited("loam", seconds), 3), config))
 
 
+def in_reverse(recording: Recording) -> Recording:
+    """The same readings with the signs of a drive backward."""
+    turned = ("speed", "motor_speed", "torque", "draft", "pitch", "acceleration")
+    return replace(recording, channels={
+        name: replace(c, value=-c.value) if name.partition(".")[0] in turned else c
+        for name, c in recording.channels.items()
+    })  # fmt: skip
+
+
 def feed_message(admission: Admission, message: can.Message) -> None:
     """One data or remote frame of python-can into an admission."""
     admission.feed(
         message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
     )
+
+
+class Notes(Notifier):
+    """The notifier's place: what the status was last."""
+
+    said = ""
+
+    def status(self, text: str) -> None:
+        self.said = text
 
 
 class HeldExecutor(InlineExecutor):
@@ -103,7 +125,8 @@ class ScriptedBus:
 class Bench:
     """A service on a scripted bus, by a clock that may go on from an earlier service.
 
-    `away` takes the bus's interface away.  `keeper` keeps its state; `pipeline` may have been prepared.
+    `away` takes the bus's interface away.  `keeper` keeps its state; `pipeline` may have been prepared.  `take` gets
+    the windows' results, which else are kept.
     """
 
     def __init__(
@@ -116,10 +139,11 @@ class Bench:
         pipeline: Pipeline | None = None,
         clock: FakeClock | None = None,
         claim: Any = None,
+        take: Callable[[WindowResult], None] | None = None,
     ) -> None:
         self.config = config or reference_configuration()
         self.clock = clock or FakeClock()
-        self.wire = ScriptedBus(self.clock, messages)
+        self.wire: Any = ScriptedBus(self.clock, messages)
         self.away = False
         self.database = output_database(self.config)
         own = [(message.frame_id, message.is_extended_frame) for message in self.database.messages]
@@ -128,7 +152,7 @@ class Bench:
         self.service = Service(
             self.config, pipeline or Pipeline(self.config, load_databases(self.config)), self.bus,
             Publisher(self.database), notifier or Notifier(), workers or InlineExecutor(), self.clock,
-            self.results.append, lambda: keeper, self.clock.wait_for, claim,
+            take or self.results.append, lambda: keeper, self.clock.wait_for, claim,
         )  # fmt: skip
 
     def _open(self) -> Any:

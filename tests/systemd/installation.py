@@ -14,8 +14,8 @@ REPO = Path(__file__).resolve().parents[2]
 PER_SECOND = 475  # frames of the recording
 
 
-def prepare(folder: Path, recording: Path, seconds: int, *, hooks: str = "", dropin: Sequence[str] = ()) -> None:
-    """Puts into the folder what tests/systemd/install.sh wants, and the first seconds of a recording as played.log.
+def prepare(folder: Path, recording: Path, seconds: int, *, hooks: str, dropin: Sequence[str]) -> None:
+    """Puts into the folder what tests/systemd/faults.sh wants, and the first seconds of a recording as played.log.
 
     hooks: a folder of the guest whose sitecustomize.py the service's Python is to run;
     dropin: directives for the unit besides those that a checkout needs.
@@ -26,7 +26,8 @@ def prepare(folder: Path, recording: Path, seconds: int, *, hooks: str = "", dro
     path = os.pathsep.join(filter(None, (hooks, _python_path())))
     (folder / "soilbus").write_text(f'#!/bin/sh\nexec env PYTHONPATH={path} {sys.executable} -m soilbus "$@"\n')
     (folder / "soilbus").chmod(0o755)
-    (folder / "dropin.conf").write_text("\n".join([_dropin(), *dropin, ""]))
+    (folder / "checkout.conf").write_text(_dropin())
+    (folder / "faults.conf").write_text("\n".join(["[Service]", *dropin, ""]))
 
 
 def properties(folder: Path, when: str) -> dict[str, str]:

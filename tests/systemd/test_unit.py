@@ -6,9 +6,11 @@ import json
 import re
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from soilbus.can.bus import ask_for_buffer
 from soilbus.cli.arguments import command_line
 
 UNITS = Path(__file__).resolve().parents[2] / "systemd"
@@ -196,3 +198,16 @@ def test_sysusers_makes_the_user_that_the_unit_names(tmp_path: Path, tool) -> No
 def test_documented_units_are_all_there() -> None:
     named = set(re.findall(r"`([\w@.-]+\.(?:service|network|sysctl|sysusers))`", (UNITS / "README.md").read_text()))
     assert named == {path.name for path in UNITS.iterdir() if path.suffix != ".md"}
+
+
+def test_the_kernels_receive_buffer_may_be_what_the_service_asks_for():
+    settings = re.findall(r"^([\w.]+) = (\d+)$", (UNITS / "soilbus.sysctl").read_text(), re.MULTILINE)
+    asked = []
+    ask_for_buffer(SimpleNamespace(setsockopt=lambda level, option, size: asked.append(size)))
+    assert asked
+    assert settings == [("net.core.rmem_max", str(size)) for size in set(asked)]
+
+
+def test_the_page_says_how_that_limit_is_installed():
+    page = (UNITS / "README.md").read_text()
+    assert '"$S"/soilbus.sysctl /etc/sysctl.d/80-soilbus.conf' in page

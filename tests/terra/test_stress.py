@@ -10,21 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from soilbus.terra.soil_laws import (
-    SHEAR_LAWS,
-    exponential_shear,
-    lumped_modulus,
-    normal_stress,
-    rational_shear,
-    shear_displacement,
-)
+from soilbus.terra.soil_laws import SHEAR_LAWS, exponential_shear, normal_stress, rational_shear, shear_displacement
 
 RATIOS = st.floats(-50.0, 50.0)
-
-
-def test_lumped_modulus_of_the_papers_wet_clay():
-    # notes.md: 43.68/0.3 + 499.3 = 644.9 kN/m^(n+2)
-    assert lumped_modulus(43.68e3, 499.3e3, 0.3) == pytest.approx(644.9e3, rel=1e-12)
 
 
 def test_normal_stress_is_bekkers_and_nothing_above_the_ground():

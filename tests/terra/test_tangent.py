@@ -37,43 +37,31 @@ def by_difference(change, step):
 @pytest.mark.parametrize(
     ("model", "field", "step"),
     [
-        (PLAIN, "peak_c1", 1e-5),
-        (PLAIN, "peak_c2", 1e-5),
+        (PLAIN, "peak_c1", 1e-5), (PLAIN, "peak_c2", 1e-5),
         (replace(PLAIN, peak_c1=0.4, peak_c2=0.2), "peak_c2", 1e-5),
         (replace(PLAIN, peak_c1=0.3, peak_c2=0.3, peak_bend=4.0), "peak_c2", 1e-5),
         (replace(PLAIN, peak_c1=0.3, peak_c2=0.3, peak_bend=4.0), "peak_bend", 1e-4),
-        (PLAIN, "exit_ratio", 1e-5),
-        (PLAIN, "exit_angle", 1e-5),
-        (REBOUNDING, "exit_angle", 1e-5),
-        (REBOUNDING, "exit_ratio", 1e-5),
-        (PLAIN, "exit_slip", 1e-5),
+        (PLAIN, "exit_ratio", 1e-5), (PLAIN, "exit_angle", 1e-5), (PLAIN, "exit_slip", 1e-5),
+        (REBOUNDING, "exit_angle", 1e-5), (REBOUNDING, "exit_ratio", 1e-5),
         (replace(REBOUNDING, exit_slip=-0.5), "exit_slip", 1e-5),
         (WheelModel("rational", nodes=NODES), "exponential_share", 1e-4),
         (WheelModel("rational", nodes=NODES, exponential_share=0.6), "exponential_share", 1e-4),
-        (PANNED, "pan_stiffness", 1e-3),
-        (PANNED, "pan_depth", 1e-6),
+        (PANNED, "pan_stiffness", 1e-3), (PANNED, "pan_depth", 1e-6),
         (replace(PANNED, pan_stiffness=0.0), "pan_stiffness", 1e-3),
+        (PLAIN, "radius", 1e-5), (PANNED, "radius", 1e-5), (REBOUNDING, "radius", 1e-5),
+        (replace(PLAIN, peak_c2=0.2), "radius", 1e-5),
     ],
-)
-def test_by_each_field_of_the_model(model, field, step):
-    def change(by):
-        return STATE, replace(model, **{field: getattr(model, field) + by})
+)  # fmt: skip
+def test_by_each_field_of_the_model_and_the_radius(model, field, step):
+    def put(value):
+        return (STATE._replace(radius=value), model) if field == "radius" else (STATE, replace(model, **{field: value}))
 
-    ours = along(STATE, replace(model, **{field: varying(getattr(model, field))}))
-    expected = by_difference(change, step)
-    scale = np.abs(wheel_forces(STATE, model)).max(axis=1, keepdims=True) / (abs(getattr(model, field)) + 1.0)
+    at = getattr(STATE if field == "radius" else model, field)
+    ours, expected = along(*put(varying(at))), by_difference(lambda by: put(at + by), step)
+    scale = np.abs(wheel_forces(STATE, model)).max(axis=1, keepdims=True) / (np.abs(at) + 1.0)
     assert np.abs(expected).max() > 0.0
-    np.testing.assert_allclose(ours / scale, expected / scale, rtol=2e-4, atol=2e-4 * np.abs(expected / scale).max())
-
-
-@pytest.mark.parametrize("model", [PLAIN, PANNED, REBOUNDING, replace(PLAIN, peak_c2=0.2)])
-def test_by_the_radius(model):
-    def change(by):
-        return STATE._replace(radius=STATE.radius + by), model
-
-    ours = along(STATE._replace(radius=varying(STATE.radius)), model)
-    expected = by_difference(change, 1e-5)
-    np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+    near = 1e-4 if field == "radius" else 2e-4
+    np.testing.assert_allclose(ours / scale, expected / scale, rtol=near, atol=near * np.abs(expected / scale).max())
 
 
 def test_changes_add_up():

@@ -71,11 +71,7 @@ def corners(slips: tuple[float, ...]) -> WheelState:
     return WheelState(angle, slip, R, B, 6e5, n, math.tan(0.4), 5e3, K)
 
 
-SITUATIONS = {
-    "drive": wheels(1, 24),
-    "skid": wheels(2, 16, slip=(-0.3, 0.0)),
-    "no slip": wheels(3, 4, slip=(0.0, 0.0)),
-}
+SITUATIONS = {"drive": wheels(1, 24), "skid": wheels(2, 16, slip=(-0.3, 0.0)), "no slip": wheels(3, 4, slip=(0.0, 0.0))}
 CORNERS = {"drive": corners((0.0, 0.3, 0.95)), "skid": corners((-0.3, -0.02))}
 
 
@@ -172,30 +168,6 @@ def test_derivatives_of_a_skidding_wheel(name):
         miss = np.abs(relative(miss, state, fine, name)).max(axis=0)
         assert np.quantile(miss, 0.98) < 1e-6
         assert miss.max() < most
-
-
-def test_scalars_and_broadcasting():
-    scalar = WheelState(0.3, 0.2, R, B, 5e5, 0.8, 0.4, 3e3, 0.02)
-    grid = scalar._replace(entry_angle=np.linspace(0.1, 0.5, 4)[:, None], slip=np.linspace(-0.2, 0.5, 5))
-    single = wheel_forces(scalar, WheelModel())
-    assert single.shape == (3,)
-    forces, jacobian = wheel_forces_and_derivatives(scalar, WheelModel())
-    assert jacobian.shape == (3, len(INPUTS))
-    assert np.array_equal(forces, single)
-    forces, jacobian = wheel_forces_and_derivatives(grid, WheelModel())
-    assert forces.shape == (3, 4, 5)
-    assert jacobian.shape == (3, len(INPUTS), 4, 5)
-    full = WheelState(*(np.broadcast_to(a, (4, 5)).copy() for a in grid))
-    every, every_jacobian = wheel_forces_and_derivatives(full, WheelModel())
-    assert forces == pytest.approx(every, rel=1e-13)
-    assert jacobian == pytest.approx(every_jacobian, rel=1e-10)
-    for i in range(4):
-        for j in range(5):
-            alone = wheel_forces(
-                scalar._replace(entry_angle=full.entry_angle[i, j], slip=full.slip[i, j]), WheelModel()
-            )
-            assert alone == pytest.approx(forces[:, i, j], rel=1e-12)
-    assert wheel_forces(scalar._replace(slip=np.zeros(0)), WheelModel()).shape == (3, 0)
 
 
 def test_many_samples_equal_the_same_in_pieces():

@@ -5,7 +5,3 @@ has another form, and where there is none by another way into the recording: ano
 on the simulated tractor, a real hill, a soil that changes.  The diagnosis sees a
 configuration and channels only.
 """
-
-from tests.lab.blind.cases import KINDS, Case, cases
-
-__all__ = ["KINDS", "Case", "cases"]

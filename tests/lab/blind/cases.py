@@ -17,15 +17,7 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
-from tests.lab.blind import (
-    contact_forms,
-    far_forms,
-    further_forms,
-    late_forms,
-    outside,
-    soil_forms,
-    vehicle_forms,
-)
+from tests.lab.blind import contact_forms, further_forms, outside, soil_forms, vehicle_forms
 from tests.lab.blind.form import SIZES, Form, Hidden, Setting, together
 from tests.lab.computed_loads import FIELD_BOUNCE
 
@@ -38,8 +30,8 @@ SOILS = (
 )  # fmt: skip
 DURATION = 120.0
 EARLIER = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS)
-PAIRED = (*EARLIER, *further_forms.FORMS)
-FORMS = (*PAIRED, *far_forms.FORMS, *late_forms.FORMS)
+PAIRED = (*EARLIER, *further_forms.FURTHER)
+FORMS = (*PAIRED, *further_forms.FAR, *further_forms.LATE)
 PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
 """Cases of these kinds for each seed: pairs of earlier forms, pairs with a further one, nulls."""
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
@@ -127,7 +119,7 @@ def _pairs(seed: int) -> Iterator[tuple[tuple[Form, ...], str]]:
         while found < count:
             one, other = (forms[i] for i in rng.choice(len(forms), 2, replace=False))
             names = {one.effect, other.effect}
-            wanted = not further or one in further_forms.FORMS or other in further_forms.FORMS
+            wanted = not further or one in further_forms.FURTHER or other in further_forms.FURTHER
             if len(names) == 2 and names not in _ALIKE and wanted:
                 found += 1
                 yield (one, other), str(rng.choice(SIZES[1:]))

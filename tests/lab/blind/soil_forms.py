@@ -63,9 +63,7 @@ def _in_the_rut(forces: Array, state: WheelState, around: Surroundings, values: 
 
     def pressure(depth: Any) -> Any:
         return np.where(
-            depth * stiff < borne,
-            depth * stiff,
-            state.K_L * np.maximum(depth - borne / stiff + rut, 0.0) ** state.n,
+            depth * stiff < borne, depth * stiff, state.K_L * np.maximum(depth - borne / stiff + rut, 0.0) ** state.n
         )
 
     return forces + change(state, pressure=pressure)

@@ -7,18 +7,15 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
-from tests.lab.blind.bound import LEAST
-from tests.lab.blind.calibration import curve
+from tests.lab.blind.calibration import curve, stated
 from tests.lab.blind.trial import Trial
 
 HALVES = ("tune", "mixed", "report")
 VISIBLE, BARELY = 100.0, 20.0
 CLEAR_GAP = 1.1
 FAR = "of which the catalogue leaves over 10 %"
-UNNAMED = 0.005
-"""Probability that a name outside the set is taken to be given."""
 
 
 class Figure(NamedTuple):
@@ -37,7 +34,11 @@ def report(trials: Sequence[Trial]) -> str:
             parts.append(f"== {half}: {len(chosen)} cases")
             parts += [f"  {figure.text}" + "  MISSED" * (figure.met is False) for figure in figures(chosen)]
     parts += ["", "== confusion, visible single effects (rows: hidden; columns: named first)", confusion(trials)]
-    parts += ["", "== calibration: reported probability of a name, names, share that was right", *calibration(trials)]
+    parts += ["", "== calibration: stated probability of a name, names, share that was right, its 95 % interval"]
+    parts += [
+        f"  {b.stated:.2f}  {b.names:4}  {b.right / b.names:.2f}  {b.low:.2f} to {b.high:.2f}"
+        for b in curve(stated(trials))
+    ]
     return "\n".join(parts) + "\n"
 
 
@@ -67,16 +68,6 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
     yield _share(f"visible, by formulas {FAR}: named first", [first(t) == t.hidden[0] for t in far])
     yield _share(f"visible, by formulas {FAR}: in the set", [t.hidden[0] in in_set(t) for t in far])
     yield _share(f"visible, by formulas {FAR}: that or unknown", [_honest(t) for t in far])
-    bounded = [t for t in single if t.bound is not None]
-    if bounded:
-        can = [t for t in bounded if t.bound is not None and t.bound >= LEAST]
-        below = [t for t in bounded if t not in can]
-        yield _share(f"not shown by this recording (bound below {LEAST:.0f})", [t in below for t in bounded])
-        yield _share("  of these: named all the same, rightly", [first(t) == t.hidden[0] for t in below])
-        yield _share("  of these: named otherwise", [first(t) not in ("", t.hidden[0]) for t in below])
-        yield _share("shown by this recording: named first", [first(t) == t.hidden[0] for t in can])
-        yield _share("shown by this recording: in the set", [t.hidden[0] in in_set(t) for t in can])
-        yield _share("shown by this recording: named otherwise", [first(t) not in ("", t.hidden[0]) for t in can])
     for kind, most in (("plain", 0.03), ("hard", 0.10), ("shaking", 0.10)):
         nulls = [t for t in trials if t.kind == kind]
         yield _share(f"nulls, {kind}: falsely named", [bool(t.named) for t in nulls], most=most)
@@ -93,11 +84,6 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
     excess = [t for t in visible if t.true_gap > CLEAR_GAP]
     gone = [bool(t.named) and t.gap_after - 1.0 <= 0.1 * (t.true_gap - 1.0) for t in excess]
     yield _share(f"visible: 90 % of the excess gone (true gap > {CLEAR_GAP})", gone, least=0.85)
-    if excess:
-        held = [_by_noise(0.1 * (t.true_gap - 1.0), t.rows) for t in excess]
-        yield Figure(
-            f"  the same of models without any error, whose gaps are 1 and noise: {100.0 * np.mean(held):.0f} %"
-        )
     if visible:
         before, after = (
             float(np.median(np.abs([getattr(t, f"bearing_{w}") for t in visible]))) for w in ("before", "after")
@@ -116,11 +102,6 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
 def _honest(trial: Trial) -> bool:
     """Whether the true name is in the set, or the diagnosis says that nothing it knows explains the data."""
     return trial.hidden[0] in in_set(trial) or trial.verdict == "unknown"
-
-
-def _by_noise(least: float, rows: int) -> float:
-    """Probability that a reduced chi-square of `rows` residuals of noise is no farther above 1 than `least`."""
-    return float(chi2.cdf((1.0 + least) * rows, rows))
 
 
 def first(trial: Trial) -> str:
@@ -143,24 +124,6 @@ def confusion(trials: Sequence[Trial]) -> str:
         f"  {hidden:18} " + ", ".join(f"{name} {n}" for name, n in named.most_common())
         for hidden, named in counts.items()
     )
-
-
-def calibration(trials: Sequence[Trial]) -> Iterator[str]:
-    """Every name of the first sets of visible and barely visible single effects: reported, cases, share that was right.
-
-    Then the expected calibration error, over these bins, and the mean logarithmic score of
-    what was reported of the truth (Gneiting & Raftery 2007, J. Am. Stat. Assoc. 102:359); a
-    name that is not in the set counts with UNNAMED.
-    """
-    chosen = [t for t in trials if t.kind == "single" and t.visible >= BARELY]
-    reported = [(p, name == t.hidden[0]) for t in chosen if t.sets for name, p in t.sets[0].items()]
-    error = 0.0
-    for one in curve(reported):
-        error += abs(one.stated - one.right / one.names) * one.names / len(reported)
-        yield f"  {one.stated:.2f}  {one.names:4}  {one.right / one.names:.2f}"
-    if chosen:
-        score = float(np.mean([-np.log(t.sets[0].get(t.hidden[0], UNNAMED) if t.sets else UNNAMED) for t in chosen]))
-        yield f"  expected calibration error {error:.3f}, logarithmic score {score:.3f} of {len(chosen)} cases"
 
 
 def _share(what: str, right: Sequence[bool], least: float | None = None, most: float | None = None) -> Figure:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.terra.effects.effect import Effect
-from tests.lab.blind.bound import bound
 from tests.lab.blind.cases import Case
 from tests.lab.blind.visible import Shown, shown
 
@@ -27,8 +26,7 @@ class Trial:
     named: names added, the one that explains most first; sets: for each of them all names
     with probabilities.  visible: what the recording shows of the effect, of two effects of
     the less visible one beside the other, and true_gap what it leaves unexplained, by the generator
-    alone (visible.py; 0 and 1 where nothing is hidden).  A diagnosis that fails has the verdict FAILED and no names.
-    bound: where loads are computed, what the recording can show of it to the service's own model (bound.py).
+    alone (visible.py).  A diagnosis that fails has the verdict FAILED and no names.
     bearing_*: relative errors of the bearing pressure; bearing_sd the relative deviation reported in the end.
     """
 
@@ -52,11 +50,6 @@ class Trial:
     bearing_after: float
     bearing_sd: float
     seconds: float
-    bound: float | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain objects."""
-        return asdict(self)
 
 
 def record_of_case(case: Case) -> Record:
@@ -72,9 +65,7 @@ def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown |
     """
     record, prior = record_of_case(case), prior_of(case.config)
     candidates = possible_effects(case.config) if candidates is None else candidates
-    if truth is None:
-        truth = shown(case) if case.parts else NOTHING
-    least = bound(case) if case.parts else None
+    truth = shown(case) if truth is None else truth
     begin = time.process_time()
     reported: dict[str, Any] = FAILED
     try:
@@ -106,13 +97,10 @@ def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown |
         visible=truth.energy,
         true_gap=truth.gap,
         seconds=time.process_time() - begin,
-        bound=least,
         **reported,
     )
 
 
-NOTHING = Shown(0.0, 1.0)
-"""What a recording shows where nothing is hidden."""
 FAILED = {
     "verdict": "failed", "named": (), "sets": (), "falls": (), "gap_before": np.inf, "gap_after": np.inf, "rows": 1,
     "bearing_before": np.inf, "bearing_after": np.inf, "bearing_sd": np.inf,

@@ -1,4 +1,4 @@
-"""How much of a hidden effect a recording can show at all, computed without any code of the diagnosis.
+"""How much of a hidden effect a recording can show at all: with a sensor of each wheel without code of the diagnosis.
 
 The tractor drives without noise and gain errors, with the effect and without.  The plain wheel-soil model h (the rim
 integral beside this file) is fitted to the readings y of the drive with it.  Unknown are the latents x of each
@@ -9,12 +9,13 @@ priors of the configuration.
 
 S is the noise of the sensors, d the residual of h for the drive without the effect: another effect, and the error of
 the rim integral against the simulator.  E is by how much -2 log posterior would fall for an analyst who adds the very
-formula of the generator.
+formula of the generator.  Where loads are computed, E is what is left of the same drive to the service's own model,
+whose weights contain their uncertainty: chi-square and prior of the fit without the effect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,12 +23,12 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import chassis_of, rig_of
-from soilbus.estimation.instrumentation import Row, unit
-from soilbus.estimation.options import ESTIMATOR
+from soilbus.diagnosis.search import FitCache
+from soilbus.estimation.assembly import chassis_of, prior_of, rig_of
+from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.vehicle import GRAVITY, axle_loads
+from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, state_on
 from tests.lab.blind.cases import Case
 from tests.lab.blind.form import Hidden, together
@@ -49,8 +50,6 @@ ENOUGH = 0.01
 """Share of the energy by which a round must lower it, else it was the last."""
 OTHER = 1.0
 """Sd of the share by which another effect may be greater or less than it is."""
-BEARING = 0.004
-"""Torque of a free wheel's bearing over load and radius."""
 
 
 class Shown(NamedTuple):
@@ -61,11 +60,19 @@ class Shown(NamedTuple):
     gap: float
 
 
+NOTHING = Shown(0.0, 1.0)
+"""What a recording shows where nothing is hidden."""
+
+
 def shown(case: Case) -> Shown:
     """What the recording shows of what is hidden in it; of two effects, of each one beside the other.
 
     SimulationError if it cannot be driven.
     """
+    if not case.parts:
+        return NOTHING
+    if rig_of(case.config).instrumentation is not None:
+        return shown_to_own_model(case)
     whole = driven_without_noise(case, case.parts)
     left = [driven_without_noise(case, case.parts[:i] + case.parts[i + 1 :]) for i in range(len(case.parts))]
     count = int(min(recording.truth["t"][-1] for recording in (whole, *left)) / BIN)
@@ -78,6 +85,16 @@ def shown(case: Case) -> Shown:
     return min(found, key=lambda each: each.energy)
 
 
+def shown_to_own_model(case: Case) -> Shown:
+    """By a fit of the service's model of plain wheels; infinite where no fit ends."""
+    record = record_of_recording(case.id, driven_without_noise(case, case.parts), case.config)
+    fitted = FitCache([record], prior_of(case.config), record.options).fit(record.training.effects)
+    if fitted is None:
+        return Shown(np.inf, np.inf)
+    left = fitted.held_out_chi2 * fitted.checked_rows
+    return Shown(fitted.neg2_log_posterior + left, 1.0 + fitted.held_out_chi2)
+
+
 def driven_without_noise(case: Case, parts: tuple[Hidden, ...]) -> Recording:
     """The drive with these parts, and sensors without noise or gain errors."""
     how = together(parts)
@@ -86,52 +103,25 @@ def driven_without_noise(case: Case, parts: tuple[Hidden, ...]) -> Recording:
     return how.after(driven)
 
 
-class _Reading(NamedTuple):
-    """What a channel reads or, where no channel is left, what is known without one (`instrumentation.Row`).
-
-    channel: its name, or that of the row; kind: "vehicle", else that of the row; weight: of the wheels (W,).
-    gain: sd of its error, and scale [N]: what that is of, where nothing is measured; bias: of a differential.
-    """
-
-    quantity: str
-    channel: str
-    kind: str
-    weight: Array
-    gain: float
-    scale: float = 0.0
-    bias: float = 0.0
-
-
-def _readings(config: Config, with_sinkage: bool) -> Iterator[_Reading]:
-    """Load, torque and speed of each wheel, sinkage where measured, then what the vehicle has."""
-    rig, W = rig_of(config), len(config.wheel)
-    given, chassis = rig.instrumentation, rig.chassis
-    assert chassis is not None
-    static = np.where(rig.front, *axle_loads(chassis, 0.0, 0.0, 0.0)) / 2.0
+def _readings(config: Config, with_sinkage: bool) -> Iterator[tuple[str, str]]:
+    """Channel and quantity: load, torque and speed of each wheel, sinkage where measured, then what the vehicle has."""
     for quantity in ("load", "torque", "speed", *["sinkage"] * with_sinkage):
-        rows: Sequence[Row] = () if given is None else getattr(given, quantity, ())
-        for i, wheel in enumerate(config.wheel):
-            row = rows[i] if rows else Row(unit(W, i), "channel", i, wheel.name, getattr(config.noise, quantity).gain)
-            weight = np.array(row.weight)
-            scale = float(static @ np.abs(weight)) if row.kind in ("weight", "transfer", "side") else 0.0
-            bias = given.couplings[row.at].bias if given is not None and row.kind == "coupling" else 0.0
-            yield _Reading(quantity, f"{quantity}.{row.name}", row.kind, weight, row.gain, scale, bias)
+        yield from ((f"{quantity}.{wheel.name}", quantity) for wheel in config.wheel)
     for quantity in ("ground_speed", "draft", "pitch", "acceleration"):
         if getattr(config.signals, quantity) is not None:
-            yield _Reading(quantity, quantity, "vehicle", np.zeros(W), getattr(config.noise, quantity).gain)
+            yield quantity, quantity
 
 
 @dataclass(frozen=True)
 class _Instants:
-    """A drive in bins: what the readings are of, their values (N, R), and the true latents (N, X).
+    """A drive in bins: channel and quantity of the readings, their values (N, R), and the true latents (N, X).
 
     Latents: entry angle and slip of each wheel, ground speed, pitch, acceleration; those of the last two that no
     sensor measures are known to be those of steady speed on level ground.  unknown: columns of the others.
-    Specific force without a pitch sensor is a steady vehicle's acceleration on level ground: the balances ask no more.
     """
 
     config: Config
-    of: tuple[_Reading, ...]
+    of: tuple[tuple[str, str], ...]
     readings: Array
     latents: Array
     unknown: list[int]
@@ -177,38 +167,18 @@ class _Instants:
         draft = pull.sum(axis=1) - chassis.mass * (GRAVITY * np.sin(pitch) + rate)
         of_wheels = {"load": load, "torque": torque, "speed": speed[:, None] / (radius * (1.0 - slip))}
         of_wheels["sinkage"] = radius * (1.0 - np.cos(angle))
-        felt = rate + GRAVITY * np.sin(pitch) * _feels_gravity(self.config)
-        whole = {"ground_speed": speed, "draft": draft, "pitch": pitch, "acceleration": felt}
-        on_axles = np.stack(axle_loads(chassis, draft, pitch, rate), axis=1)
-        front = np.array([wheel.axle == "front" for wheel in wheels])
-        columns = []
-        for row in self.of:
-            column = whole[row.quantity] if row.kind == "vehicle" else of_wheels[row.quantity] @ row.weight
-            if row.kind in ("weight", "transfer"):
-                column = column - on_axles @ [row.weight[front].mean(), row.weight[~front].mean()]
-            columns.append(column + row.scale)
-        return np.stack(columns, axis=1)
+        found = {"ground_speed": speed, "draft": draft, "pitch": pitch, "acceleration": rate}
+        for quantity, values in of_wheels.items():
+            found |= {f"{quantity}.{wheel.name}": values[:, i] for i, wheel in enumerate(wheels)}
+        return np.stack([found[channel] for channel, _ in self.of], axis=1)
 
     def noise(self, value: Array) -> Array:
         """Sd of each reading (N, R) of these values."""
-        sd, options = np.empty_like(value), ESTIMATOR.measurements
-        computed = self.config.noise.computed_load.relative * np.sqrt(2.0 * options.load_time_scale / BIN)
-        of_slope = options.unknown_slope * (self.config.signals.roll is None)
-        load, _, torque = self._forces(self.latents, self.log_soil)
-        grip = load * [wheel.radius for wheel in self.config.wheel]
-        for k, row in enumerate(self.of):
-            if row.kind not in ("channel", "vehicle"):
-                of_row = {
-                    "weight": computed / 2.0 * row.scale, "transfer": computed / 2.0 * row.scale,
-                    "side": np.hypot(computed / np.sqrt(2.0), of_slope) * row.scale,
-                    "free": BEARING * grip @ np.abs(row.weight),
-                    "coupling": row.bias * np.abs(torque) @ np.abs(row.weight),
-                }  # fmt: skip
-                sd[:, k] = of_row[row.kind] / np.sqrt(EVERY)
-                continue
-            noise = getattr(self.config.noise, row.quantity)
+        sd = np.empty_like(value)
+        for k, (_, quantity) in enumerate(self.of):
+            noise = getattr(self.config.noise, quantity)
             of_mean = noise.of_mean * np.abs(value[:, k]).mean()
-            samples = EVERY * BIN * SAMPLE_RATE / (2.0 if row.quantity == "ground_speed" else 1.0)
+            samples = EVERY * BIN * SAMPLE_RATE / (2.0 if quantity == "ground_speed" else 1.0)
             sd[:, k] = np.sqrt((noise.absolute**2 + (noise.relative * value[:, k]) ** 2 + of_mean**2) / samples)
         return sd
 
@@ -216,7 +186,7 @@ class _Instants:
         """Sd of the logarithms of the soil's parameters (6,), and of the gain errors (R,)."""
         priors = [self.config.soil_prior[name] for name in Soil._fields]
         soil = [float(np.sqrt(np.log1p((prior.std / prior.value) ** 2))) for prior in priors]
-        return np.array(soil), np.array([row.gain for row in self.of])
+        return np.array(soil), np.array([getattr(self.config.noise, quantity).gain for _, quantity in self.of])
 
 
 def _instants(case: Case, recording: Recording, count: int) -> _Instants:
@@ -230,23 +200,10 @@ def _instants(case: Case, recording: Recording, count: int) -> _Instants:
     latents += [truth("ground_speed")]
     mapped = [getattr(config.signals, q) is not None for q in ("pitch", "acceleration")]
     latents += [truth(q) * there for q, there in zip(("pitch", "acceleration"), mapped, strict=True)]
-    if _feels_gravity(config) and not mapped[0]:
-        latents[-1] = latents[-1] + GRAVITY * np.sin(truth("pitch"))
     unknown = np.flatnonzero([True] * (len(latents) - 2) + mapped).tolist()
-    readings = []
-    for row in of:
-        if row.kind in ("channel", "vehicle"):
-            channel = recording.channels[row.channel]
-            readings.append(_binned(channel.t, channel.value, count))
-        else:
-            readings.append(np.full(len(latents[0]), row.scale))
+    readings = [_binned(recording.channels[name].t, recording.channels[name].value, count) for name, _ in of]
     log_soil = np.log(np.array(case.soil, float))
     return _Instants(config, of, np.stack(readings, axis=1), np.stack(latents, axis=1), unknown, log_soil)
-
-
-def _feels_gravity(config: Config) -> bool:
-    mapped = config.signals.acceleration
-    return mapped is not None and mapped.kind == "specific_force"
 
 
 def _binned(t: Array, value: Array, count: int) -> Array:

@@ -7,8 +7,7 @@ import time
 from collections.abc import Sequence
 
 from tests.lab.soak.figures import Hour
-from tests.lab.soak.run import HOUR, soak
-from tests.lab.soak.verdict import demands
+from tests.lab.soak.run import HOUR, demands, soak
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

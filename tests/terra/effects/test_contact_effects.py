@@ -33,19 +33,24 @@ def same(ours: np.ndarray, true: np.ndarray, tolerance: float = 1e-6) -> None:
 
 
 @EACH_WHEEL
-def test_the_peak_of_stress_moves_as_wong_and_reece_say(state):
-    c1, c2 = -0.15, 0.3
-    true = adaptive_forces(state, WheelModel("rational", peak_c1=0.35, peak_c2=0.3))
-    same(with_effect("stress_peak_shift", state, c1=c1, c2=c2), true)
-    moved = WheelModel("rational", peak_c1=0.45, peak_c2=0.1)
-    same(with_effect("stress_peak_shift", state, moved, c1=c1, c2=c2),
-         adaptive_forces(state, WheelModel("rational", peak_c1=0.3, peak_c2=0.4)))  # fmt: skip
-
-
-@EACH_WHEEL
-def test_a_peak_of_stress_levels_off_with_slip(state):
-    true = adaptive_forces(state, WheelModel("rational", peak_c1=0.3, peak_c2=0.3, peak_bend=4.0))
-    same(with_effect("stress_peak_shift", state, c1=-0.2, c2=0.3, bend=4.0), true)
+@pytest.mark.parametrize(
+    ("name", "values", "plain", "changed"),
+    [
+        # Wong and Reece's peak, before and with what a soil has of its own, and one that levels off
+        ("stress_peak_shift", {"c1": -0.15, "c2": 0.3}, {}, {"peak_c1": 0.35, "peak_c2": 0.3}),
+        ("stress_peak_shift", {"c1": -0.15, "c2": 0.3}, {"peak_c1": 0.45, "peak_c2": 0.1},
+         {"peak_c1": 0.3, "peak_c2": 0.4}),
+        ("stress_peak_shift", {"c1": -0.2, "c2": 0.3, "bend": 4.0}, {},
+         {"peak_c1": 0.3, "peak_c2": 0.3, "peak_bend": 4.0}),
+        # a rut that comes up by an angle of its own, and soil carried behind, on which the wheel leaves it the later
+        ("rut_recovery", {"recovery": 0.1, "angle": 0.05}, {}, {"exit_ratio": -0.1, "exit_angle": -0.05}),
+        ("rut_recovery", {"recovery": 0.1, "angle": 0.3}, {}, {"exit_ratio": -0.1, "exit_angle": -0.3}),
+        ("rut_recovery", {"recovery": 0.1, "carried": 0.5}, {}, {"exit_ratio": -0.1, "exit_slip": -0.5}),
+    ],
+)  # fmt: skip
+def test_an_effect_on_the_stress_is_the_integral_with_other_angles(state, name, values, plain, changed):
+    ours = with_effect(name, state, WheelModel("rational", **plain), **values)
+    same(ours, adaptive_forces(state, WheelModel("rational", **changed)))
 
 
 @EACH_WHEEL
@@ -56,19 +61,6 @@ def test_a_rut_that_recovers_carries_behind_the_axle(state):
     plain = wheel_forces(state, MODEL)
     assert ours[0] > plain[0]
     assert ours[1] / ours[0] > plain[1] / plain[0]  # it pushes
-
-
-@EACH_WHEEL
-@pytest.mark.parametrize("angle", [0.05, 0.3])
-def test_a_rut_may_come_up_by_an_angle_of_its_own(state, angle):
-    true = adaptive_forces(state, WheelModel("rational", exit_ratio=-0.1, exit_angle=-angle))
-    same(with_effect("rut_recovery", state, recovery=0.1, angle=angle), true)
-
-
-@EACH_WHEEL
-def test_soil_carried_behind_a_slipping_wheel_is_left_later(state):
-    true = adaptive_forces(state, WheelModel("rational", exit_ratio=-0.1, exit_slip=-0.5))
-    same(with_effect("rut_recovery", state, recovery=0.1, carried=0.5), true)
 
 
 @EACH_WHEEL
@@ -118,14 +110,6 @@ def test_lugs_shear_at_their_sides_as_bekker_has_it():
     assert pytest.approx(tuple(true[:2]), rel=1e-12) == (W, DP)
     assert pytest.approx(true[2] * 0.54 / 0.5, rel=1e-12) == T
     assert with_effect("lugs", state, height=h, share=0.0)[2] == pytest.approx(true[2], rel=1e-12)
-
-
-def test_lugs_without_cohesion_are_a_greater_angle_of_friction():
-    state = state_on(soil_named("dry_sand"), 0.4, 0.3, 0.5, 0.3)._replace(c=0.0)
-    lugged = with_effect("lugs", state, height=0.05, share=0.0)
-    ratio = 0.05 / 0.3
-    factor = 1.0 + 0.64 * ratio * math.atan(1.0 / ratio)
-    assert lugged == pytest.approx(wheel_forces(state._replace(tan_phi=state.tan_phi * factor), MODEL), rel=1e-12)
 
 
 def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():

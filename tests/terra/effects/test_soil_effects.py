@@ -14,17 +14,8 @@ from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
 from soilbus.terra.effects.soil import SLIP_SINKAGE
 from soilbus.terra.effects.steady import CompletedModel, Wheel
-from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
-from soilbus.terra.wheel import (
-    INPUTS,
-    WheelModel,
-    WheelState,
-    sinkage,
-    state_on,
-    wheel_forces,
-    wheel_forces_and_derivatives,
-)
+from soilbus.terra.wheel import INPUTS, WheelModel, WheelState, state_on, wheel_forces, wheel_forces_and_derivatives
 from wheels_around import REAR, one_wheel, wheels_around
 
 MODEL = WheelModel("rational")
@@ -148,19 +139,6 @@ def test_derivatives_know_of_the_pan(name):
     up, down = (wheel_forces(STATE._replace(**{name: at + way * step}), model) for way in (1.0, -1.0))
     miss = np.abs((up - down) / (2.0 * step) - jacobian[:, INPUTS.index(name)]) * np.abs(at)
     assert np.max(miss) < 1e-7 * np.max(forces[0])
-
-
-def test_a_wheel_that_reaches_the_pan_hardly_sinks_further():
-    """A tenfold load doubles no sinkage where the pan is near rigid."""
-    state = state_on(soil_named("loam"), np.nan, 0.1, 0.5, 0.3)
-    _, pan = wheel_with(
-        [Active(CATALOGUE["hardpan"], {"stiffness": 50.0, "depth": 0.03})], state, MODEL, one_wheel(AROUND)
-    )
-    shallow, deep, soft = (
-        float(sinkage(entry_angle_for_load(load, state, model), 0.5))
-        for load, model in ((4e3, pan), (4e4, pan), (4e4, MODEL))
-    )
-    assert 0.02 < shallow < deep < 0.1 < soft
 
 
 def test_the_soil_drifts_along_the_way():

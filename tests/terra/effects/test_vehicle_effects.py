@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.signal import lsim, lti
 
-from soilbus.terra.effects.along import stretches, through_low_pass
+from soilbus.terra.effects.along import stretches
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, wheel_with
 from soilbus.terra.effects.sensors import read_late
@@ -48,14 +46,6 @@ def test_friction_of_a_drive_line_falls_with_speed():
     assert lost - churned == pytest.approx(np.array([[65.0, 32.5, -17.5]]))
     still = AROUND._replace(wheel_speed=np.zeros((1, 3)))
     assert np.isfinite(torque_of("drivetrain_loss", torque, still, share=0.1, fading=1.5)).all()
-
-
-def test_a_constant_slope_holds_back_as_the_weight_along_it():
-    grade = CATALOGUE["grade"]
-    held = grade.resistance(AROUND, grade.neutral | {"slope_0": 0.05})
-    assert held.shape == (len(AROUND.t),)
-    assert held == pytest.approx(2300.0 * 9.80665 * math.sin(0.05), rel=1e-12)
-    assert grade.parameters[0].name == "slope_0"
 
 
 def test_a_slope_changes_along_the_way():
@@ -126,15 +116,6 @@ def test_a_filtered_torque_is_that_of_a_first_order_lag(lag):
     assert both == pytest.approx(torque_of("torque_lag", queued, around, time_constant=lag), rel=1e-12)
 
 
-def test_a_low_pass_is_the_same_however_finely_it_is_looked_at():
-    t = np.cumsum(np.random.default_rng(5).uniform(0.05, 0.2, 60))
-    values = np.random.default_rng(6).normal(size=(60, 1))
-    fine = np.sort(np.concatenate([t, t[:-1] + 0.3 * np.diff(t)]))
-    between = np.interp(fine, t, values[:, 0])[:, None]
-    whole, divided = through_low_pass(t, values, 0.4), through_low_pass(fine, between, 0.4)
-    assert divided[np.isin(fine, t)] == pytest.approx(whole, rel=1e-10)
-
-
 def test_nothing_is_late_or_fast_across_a_gap():
     """Two runs with a minute between: each as if alone."""
     t = np.concatenate([T[:50], T[:50] + 65.0])
@@ -175,12 +156,5 @@ def test_a_zero_settles_as_what_warms_up(settling):
     assert wheels == pytest.approx(of_wheels["offset"] + (hitch[:, None] - 250.0) * of_wheels["drift"] / 0.5, abs=1e-9)
 
 
-def test_each_wheels_load_cell_has_its_own_zero():
-    effect = CATALOGUE["wheel_load_offset"]
-    assert effect.each_wheel
-    error = effect.load(
-        AROUND, {"offset": np.array([100.0, 0.0, -300.0, 50.0]), "drift": np.zeros(4), "settling": np.full(4, 0.01)}
-    )
-    assert error.shape == AROUND.load.shape
-    assert np.all(error == [100.0, 0.0, -300.0, 50.0])
+def test_the_wheels_load_cells_alone_have_parameters_of_their_own():
     assert [e.name for e in CATALOGUE.values() if e.each_wheel] == ["wheel_load_offset"]
