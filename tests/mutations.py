@@ -129,14 +129,14 @@ MUTATIONS = (
     ),
     Mutation(
         "gains never drift", "estimation/tracker.py",
-        "gains = problem.gain_std**2 * min(elapsed / self.options.gain_memory, 1.0)",
-        "gains = 0.0 * problem.gain_std",
-        ("tests/estimation/test_tracker_drift.py::test_gains_are_known_for_minutes_and_not_for_ever",),
+        "forgotten = 1.0 / self.options.gain_memory + (t - end) / self.options.gain_correlation_time",
+        "forgotten = 0.0",
+        ("tests/estimation/test_tracker_drift.py::test_gains_are_known_for_hours_and_not_for_ever",),
     ),
     Mutation(
         "the soil never drifts", "estimation/tracker.py",
-        "gaussian.drifted(self._drift(gaussian, elapsed), gains)",
-        "gaussian.drifted(0.0 * self._drift(gaussian, elapsed), gains)",
+        "gaussian.drifted(self._drift(gaussian, elapsed))",
+        "gaussian.drifted(0.0 * self._drift(gaussian, elapsed))",
         ("tests/estimation/test_tracker_drift.py::test_the_soil_of_an_hour_ago_is_no_more_than_another_soil",),
     ),
     Mutation(
