@@ -29,7 +29,8 @@ class Margin(NamedTuple):
 
     rows (N, 5): time [s], common slip, pull given [N], demand of draft and slope [N] of the last moments, and demand
     that they foresaw `settling_time` later.  since [s]: of the first moment without a gap.  error, checks: sum of
-    squares of what came less what was foreseen, and their number.  cause: what is seen now, empty for nothing.
+    squares of what came less what was foreseen, and their number.  calm [s]: the last moment at which no trend led to
+    the limit.  cause: what is seen now, empty for nothing.
     time_left [s]: until the capacity falls to the demand, inf where it does not; None where it is not known.
     """
 
@@ -37,6 +38,7 @@ class Margin(NamedTuple):
     since: float = math.inf
     error: float = 0.0
     checks: int = 0
+    calm: float = -math.inf
     cause: str = ""
     time_left: float | None = None
 
@@ -48,7 +50,7 @@ def left_by(
     t, slip, *_ = row
     last = float(before.rows[-1, 0]) if len(before.rows) else -math.inf
     if not 0.0 < t - last <= LONGEST_GAP:
-        before, last = Margin(since=t), t
+        before, last = Margin(since=t, calm=t), t
     step, age = t - last, t - before.since
     rows = np.vstack([before.rows[before.rows[:, 0] > t - options.warning_time], (*row, math.nan)])
     x = rows[:, 0] - t
@@ -58,7 +60,7 @@ def left_by(
     past = rows[x <= 0.5 * step - options.settling_time]
     if len(past) and age >= 2.0 * options.settling_time:
         error, checks = error + (demand - float(past[-1, 4])) ** 2, checks + 1
-    now = Margin(rows, before.since, error, checks)
+    now = Margin(rows, before.since, error, checks, calm=t)
     if curve is None or age < options.settling_time:
         return now
     slips, pulls, ahead, std = _known(curve)
@@ -86,12 +88,15 @@ def left_by(
         if 0.5 * math.erfc(spare / (math.sqrt(2.0) * math.hypot(wrong, width, 1e-9))) > options.outgrows:
             outgrows = max(limit - demand, 0.0) / rise
     weakens = _time_to_weaken(x, capacity, reserve, float(rows[:, 3].max()), options)
-    cause = now.cause
-    if outgrows < math.inf:
-        cause = f"draft and slope are to outgrow the ground in {outgrows:.0f} s"
+    now = now._replace(time_left=min(outgrows, weakens))
+    if outgrows == math.inf and not weakens < options.warning_time:
+        return now
+    if t - before.calm < options.lasting - 0.5 * step:
+        return now._replace(calm=before.calm)
+    cause = f"draft and slope are to outgrow the ground in {outgrows:.0f} s"
     if weakens < options.warning_time:
         cause = f"the ground is to give less than is asked in {weakens:.0f} s"
-    return now._replace(cause=cause, time_left=min(outgrows, weakens))
+    return now._replace(calm=before.calm, cause=cause)
 
 
 def _line(x: Array, y: Array, memory: float) -> tuple[float, float]:

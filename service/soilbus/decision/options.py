@@ -35,6 +35,9 @@ class WatchOptions:
     warning_time: float = 10.0
     """Time [s] ahead within which a capacity is to fall to the demand, or a demand is to outgrow it, and back for which
     moments are kept: some swings of a draft."""
+    lasting: float = 0.2
+    """Time [s] for which a trend must lead to the limit before it warns.  At 0.4 the edge of a soft patch is felt 0.2 s
+    too late; at 0 `d-rough-0` warned once where nothing happened."""
     significant_sd: float = 2.5
     """Standard deviations by which a capacity must fall."""
     form_error: float = 0.1
