@@ -116,3 +116,24 @@ def test_a_disengaged_axle_has_the_rows_of_one_that_is_configured_to_roll_freely
     assert one.rows == pytest.approx(two.rows, rel=1e-9, abs=1e-9)
     assert one.weighed == pytest.approx(two.weighed, rel=1e-9, abs=1e-12)
     assert one.chi2 == pytest.approx(two.chi2)
+
+
+def test_each_choice_of_axles_keeps_what_it_has_learned():
+    """Four wheels drive, two, and four again: the third part goes on from the first, and knows more than it did."""
+    config = with_a_shaft_to_both_axles(1.05)
+    intake, estimator = Intake(config, load_databases(config)), WindowEstimator(config)
+    trackers, drafts = [], []
+    for part, truth in enumerate((config, TRUTH, config)):
+        begin = 0.0
+        for message in frames(simulate(truth, excited("loam", 14.0), 5 + part), truth):
+            begin = begin or message.timestamp
+            message.timestamp += 14.0 * part
+            feed_message(intake.admission, message)
+        intake.ingest()
+        found = [estimator.solve(task) for task in intake.due(begin + 14.0 * (part + 1) - 0.2)]
+        trackers.append(estimator.tracker)
+        drafts.append(found[-1].traversability.max_draft)
+    assert trackers[0] is trackers[2] is not trackers[1]
+    assert drafts[2].std < drafts[0].std
+    assert abs(drafts[2].value - exact_drafts()[1]) < 2.5 * drafts[2].std
+    assert drafts[1].value < 0.8 * drafts[2].value
