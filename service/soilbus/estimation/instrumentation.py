@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +33,6 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window, pairs, steady, zero_if_unknown
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, wheel_loads
-
-__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "unknown_draft", "with_speeds"]
 
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
@@ -109,22 +108,17 @@ class Instrumentation:
     motors: tuple[Group, ...] = ()  # those that drive several wheels
 
     @property
-    def torque_matrix(self) -> Array:
-        """M of the torques (W, W)."""
-        return np.array([row.weight for row in self.torque])
-
-    @property
     def latent_matrix(self) -> Array:
         """M of loads, speeds and ground speed (2 W + 1, 2 W + 1)."""
         W = len(self.load)
         M = np.eye(2 * W + 1)
-        M[:W, :W], M[W : 2 * W, W : 2 * W] = ([row.weight for row in rows] for rows in (self.load, self.speed))
+        M[:W, :W], M[W : 2 * W, W : 2 * W] = matrix(self.load), matrix(self.speed)
         return M
 
     @property
     def loads_by_torques(self) -> NDArray[np.bool_]:
         """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
-        computed, wheels = self.computes("torque"), np.array([row.weight for row in self.load]) != 0.0
+        computed, wheels = self.computes("torque"), matrix(self.load) != 0.0
         sums = [on for on, row in zip(wheels, self.load, strict=True) if row.kind == "channel"]
         return np.array([
             row.kind == "side" and not computed[on].any() and any(np.array_equal(on, of_sum) for of_sum in sums)
@@ -134,14 +128,13 @@ class Instrumentation:
     @property
     def sides(self) -> tuple[tuple[int, int], ...]:
         """Row of torques and row of loads of each two wheels with equal torques and computed loads."""
-        wheels = {q: [np.array(row.weight) != 0.0 for row in getattr(self, q)] for q in ("torque", "load")}
         return tuple(
             (i, k)
             for i, torque in enumerate(self.torque)
             for k, load in enumerate(self.load)
             if torque.kind == "coupling" and load.kind == "side"
             if self.couplings[torque.at].is_open
-            if np.array_equal(wheels["torque"][i], wheels["load"][k])
+            if [w != 0.0 for w in torque.weight] == [w != 0.0 for w in load.weight]
         )
 
     @property
@@ -154,6 +147,18 @@ class Instrumentation:
         """Return which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)
         return np.array([any(r.weight[w] for r in rows if r.kind != "channel") for w in range(len(rows))])
+
+
+@lru_cache(64)
+def matrix(rows: tuple[Row, ...]) -> Array:
+    """Return M (W, W) of a quantity's rows."""
+    return np.array([row.weight for row in rows])
+
+
+@lru_cache(64)
+def inverse(rows: tuple[Row, ...]) -> Array:
+    """Return M^-1 (W, W) of a quantity's rows."""
+    return np.asarray(np.linalg.inv(matrix(rows)))
 
 
 def rows_of(
@@ -218,8 +223,8 @@ def completed(window: Window, rig: Rig) -> Window:
     given = rig.instrumentation
     if given is None or window.observations is not None or not len(window.t):
         return window
-    load, load_of, load_var, by_inertia, by_draft = _loads(window, rig, given)
-    speed, speed_of, speed_var = _speeds(window, rig, given)
+    load_of, load_var, load_read, by_inertia, by_draft = _loads(window, rig, given)
+    speed_of, speed_var = _speeds(window, rig, given)
     torque, torque_of, torque_var = _torques(window, given)
     observations = Observations(
         torque_of,
@@ -228,14 +233,18 @@ def completed(window: Window, rig: Rig) -> Window:
         np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
         *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
     )
+    columns: dict[str, Any] = {
+        "torque": torque,
+        "load": _combined(load_read, inverse(given.load)),
+        "speed": _combined(speed_of, inverse(given.speed)),
+    }
     variance = dict(window.variance)
     for quantity, rows, of_rows in (
         ("load", given.load, load_var), ("speed", given.speed, speed_var), ("torque", given.torque, torque_var),
     ):  # fmt: skip
-        inverse = np.linalg.inv(np.array([row.weight for row in rows]))
         known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
-        variance[quantity] = _combined(known, inverse**2)
-    return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
+        variance[quantity] = _combined(known, inverse(rows) ** 2)
+    return replace(window, variance=variance, observations=observations, **columns)
 
 
 def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
@@ -279,7 +288,7 @@ def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
     given, observations = rig.instrumentation, window.observations
     if given is not None and observations is not None:
         W, value = len(rig.wheels), observations.value.copy()
-        value[:, W : 2 * W] = _combined(speed, np.array([row.weight for row in given.speed]))
+        value[:, W : 2 * W] = _combined(speed, matrix(given.speed))
         observations = observations._replace(value=value)
     return replace(window, speed=speed, observations=observations)
 
@@ -305,11 +314,6 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
     return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **columns)
 
 
-def _solved(rows: Sequence[Row], observed: Array) -> Array:
-    """Values of the wheels (N, W) from those of the rows (N, W)."""
-    return _combined(observed, np.linalg.inv(np.array([row.weight for row in rows])))
-
-
 def _combined(values: Array, weight: Array) -> Array:
     """Weighted sums (N, W) of values (N, W); nan where a value with a weight is nan; those without one do not count."""
     unknown = np.isnan(values)
@@ -320,21 +324,20 @@ def _combined(values: Array, weight: Array) -> Array:
 
 
 def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array, Array, Array]:
-    """Loads of the wheels; observations of them, their variances, and what they follow as in `Observations` (N, W)."""
-    n, W, window = len(window.t), len(given.load), steady(window)
+    """Observations of loads, their variances, what the rows read, and what they follow as in `Observations` (N, W)."""
+    n, W, window, chassis = len(window.t), len(given.load), steady(window), rig.chassis
     load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
-    chassis = rig.chassis
+    if chassis is not None:
+        weight, direction = chassis.mass * GRAVITY, window.directions
+        pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
+        static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
+        upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
     for i, row in enumerate(given.load):
         if row.kind == "channel":
             load[:, i] = scale[:, i] = window.load[:, row.at]
             variance[:, i] = window.variance["load"][:, row.at]
             continue
         assert chassis is not None  # `rig_of` sees to it
-        weight = chassis.mass * GRAVITY
-        pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
-        direction = window.direction if len(window.direction) else np.ones(n)
-        static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
-        upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
         if row.kind == "weight":
             scale[:, i], variance[:, i] = weight * np.cos(pitch), (given.load_noise / 2.0 * weight) ** 2
             load[:, i] = scale[:, i] + _heave(window, rig, given)
@@ -368,19 +371,17 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
                 (rig.options.measurements.unknown_slope * axle) ** 2,
             )
             variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
-    return _solved(given.load, load), scale, variance, by_inertia, by_draft
+    return scale, variance, load, by_inertia, by_draft
 
 
 def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
-    """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N].
-
-    An axle bounces on its own tyres: with a dynamic index near one, as tractors have it, the other one does not lose
-    what it gains (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, which shifts load between axles.
-    """
+    """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N]."""
+    # An axle bounces on its own tyres: with a dynamic index near one the other one does not lose what it gains
+    # (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, which shifts load between axles.
     channels = [row for row in given.load if row.kind == "channel"]
     if rig.chassis is None or not channels:
         return np.zeros(len(window.t))
-    direction = window.direction if len(window.direction) else np.ones(len(window.t))
+    direction = window.directions
     along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
     of_wheels = wheel_loads(rig.chassis, rig.ahead, direction * window.draft, *along)
     beyond = np.sum([window.load[:, row.at] - np.array(row.weight) @ of_wheels for row in channels], axis=0)
@@ -420,8 +421,8 @@ def _known_var(window: Window, quantity: str) -> Array:
     return np.where(np.isfinite(getattr(window, quantity)) & np.isfinite(variance), variance, 0.0)
 
 
-def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array]:
-    """Speeds of the wheels, observations of them and their variances, each (N, W)."""
+def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array]:
+    """Observations of the wheels' speeds and their variances, each (N, W)."""
     n, W = len(window.t), len(given.speed)
     speed, variance = np.zeros((n, W)), np.zeros((n, W))
     options = rig.options.measurements
@@ -436,7 +437,7 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
         elif row.kind != "same":  # what turns together has no difference
             speed[:, i] = rolling[:, row.at]
             variance[:, i] = (options.slip_sd * rolling[:, row.at]) ** 2
-    return _solved(given.speed, speed), speed.copy(), variance
+    return speed, variance
 
 
 def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Array]:
@@ -451,7 +452,8 @@ def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Arra
         else:
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
             size = np.abs(zero_if_unknown(shares)) @ weight
-            variance[:, i] = np.where(_may_be_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
+            may_be_locked = _locked(window, coupling) | (coupling.is_switched & np.isnan(window.differential_lock))
+            variance[:, i] = np.where(may_be_locked, np.nan, (coupling.bias * size) ** 2)
     return shares, np.where(np.isfinite(variance), torque, np.nan), variance
 
 
@@ -463,23 +465,21 @@ def _torque_readings(window: Window, given: Instrumentation) -> Array:
 
 def _shares(window: Window, given: Instrumentation) -> Array:
     """Torques of the wheels (N, W) where differentials share them equally."""
-    return _solved(given.torque, _torque_readings(window, given))
+    return _combined(_torque_readings(window, given), inverse(given.torque))
 
 
 def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
     """At which instants (N,) a differential is locked."""
-    switched = np.zeros(len(window.t), bool)
-    if coupling.of_axle and len(window.differential_lock):
-        switched = zero_if_unknown(window.differential_lock) > 0.5
-    return np.asarray(switched | coupling.locked)
+    return np.asarray((coupling.of_axle & (zero_if_unknown(window.differential_lock) > 0.5)) | coupling.locked)
 
 
-def _may_be_locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
-    """At which instants (N,) a differential is locked, or its lock is silent."""
-    locked = _locked(window, coupling)
-    if coupling.is_switched and len(window.differential_lock):
-        locked |= ~np.isfinite(window.differential_lock)
-    return locked
+def rows_in(rig: Rig, quantity: str) -> tuple[Row, ...]:
+    """Return the rows of torques, loads or speeds; without an instrumentation a channel of each wheel."""
+    if rig.instrumentation is not None:
+        found: tuple[Row, ...] = getattr(rig.instrumentation, quantity)
+        return found
+    W, gain = len(rig.wheels), rig.noise[quantity].gain
+    return tuple(Row(unit(W, i), "channel", i, name, gain) for i, name in enumerate(rig.wheels))
 
 
 def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:

@@ -354,7 +354,7 @@ class ObservationModel(Measurements):
         residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains]
         residual[:, layout.balance] = delay.demand
         residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
-        residual[~self._known] = 0.0
+        residual[~self.known] = 0.0
         return residual
 
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
@@ -434,7 +434,7 @@ class ObservationModel(Measurements):
         """
         root = np.sqrt(np.einsum("nmm->nm", at.inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
-        weighed[~self._known] = np.nan
+        weighed[~self.known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
 
     def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
@@ -453,7 +453,7 @@ class ObservationModel(Measurements):
         if self.with_sinkage:
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
         self._without_sides(rows, at.by_sides)
-        rows[~self._known] = 0.0
+        rows[~self.known] = 0.0
         weighed = at.inverse @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 

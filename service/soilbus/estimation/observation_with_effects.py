@@ -21,7 +21,7 @@ from soilbus.estimation.linearisation import (
 )
 from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_derivatives
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
 from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.tangent import forces_along
@@ -268,7 +268,7 @@ class ObservationModelWithEffects(ObservationModel):
 
     def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Zero corrections (N, columns) and derivatives (P, N, columns)."""
-        columns = self._curves.number_of(quantity)
+        columns = self.n_wheels if quantity in WHEEL_QUANTITIES else 1
         return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:

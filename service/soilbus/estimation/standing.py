@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.estimation.instrumentation import rows_in
 from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
@@ -77,12 +78,7 @@ def standing_columns(window: Window, rig: Rig, slopes: Mapping[str, Array] | Non
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
     columns.torque[:, :, 1] = -wheel_inertia(rig) * speed
-    columns.latents[:, :W, 2] = load if _measures_loads(rig) else 0.0
+    columns.latents[:, :W, 2] = load if all(row.kind == "channel" for row in rows_in(rig, "load")) else 0.0
     columns.latents[:, 2 * W, 3], columns.demand[:, 4] = ground, draft
     columns.demand[:, 5] = rig.chassis.mass * acceleration
     return columns
-
-
-def _measures_loads(rig: Rig) -> bool:
-    given = rig.instrumentation
-    return given is None or all(row.kind == "channel" for row in given.load)
