@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 from soilbus.estimation.change_detection import ChangeStatistic, Transition
 
-__all__ = ["ChangePoint", "Reason", "Shown", "SoilState", "TrackerState", "next_state"]
-
 
 class TrackerState(StrEnum):
     """Soil that a window's estimate is of: the same, another, or undecided."""
