@@ -29,8 +29,7 @@ _SOIL = len(PARAMETERS)
 class Gaussian:
     """Mean and covariance of the soil's logarithms and the sensors' gains."""
 
-    # (6,) in SI: the mean in the coordinates in which a window is nearest to Gaussian (see `parametrization`)
-    soil: Array
+    soil: Array  # (6,) in SI: the mean in the coordinates of `parametrization`
     gains: Array  # (G,), relative errors of the sensors and standardised effect parameters
     covariance: Array  # (6 + G, 6 + G), of the soil's logarithms and the gains; rows of held ones are zero
     form: FormPosterior | None = None  # what the model's form leaves open; everything else is of the configured form
@@ -68,8 +67,9 @@ class Gaussian:
         return self._with_gains(at, kept * covariance @ (precision @ self.gains[at]), covariance)
 
     def given(self, at: NDArray[np.intp], gains: Array) -> Gaussian:
-        """Return the Gaussian where the gains at these places (K,) have these values (K,)."""
-        return self._with_gains(at, gains, np.zeros((len(at), len(at))))
+        """Return the Gaussian where the gains at these places (K,) have these values (K,); held ones stay."""
+        free = np.diag(self.covariance)[_SOIL + at] > 0.0
+        return self._with_gains(at[free], gains[free], np.zeros((free.sum(),) * 2))
 
     def _with_gains(self, at: NDArray[np.intp], gains: Array, covariance: Array) -> Gaussian:
         """The Gaussian with another mean (K,) and covariance (K, K) of the gains at these places."""

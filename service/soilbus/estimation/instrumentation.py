@@ -39,31 +39,23 @@ LEAST_WEIGHT = 1e-12
 
 
 class Group(NamedTuple):
-    """A channel of one wheel or more: sum(weight x) over these wheels.
-
-    name: of the wheel or the axle that it is mapped for.
-    """
+    """A channel of one wheel or more: sum(weight x) over these wheels."""
 
     wheels: tuple[int, ...]
     weight: tuple[float, ...]
-    name: str
+    name: str  # of the wheel or the axle that it is mapped for
 
 
 class Coupling(NamedTuple):
-    """Two sets of wheels behind a differential; ratio (W,): turns of the shaft before it for one of the wheel.
-
-    bias: sd of the difference of the torques over their sum; locked: the speeds are equal, and the torques differ by
-    anything; is_open: the torques are equal but for friction; of_axle: the vehicle's differential lock acts on it;
-    is_switched: a signal says whether it does.
-    """
+    """Two sets of wheels behind a differential."""
 
     one: tuple[int, ...]
     other: tuple[int, ...]
-    bias: float
-    locked: bool
-    is_open: bool
-    of_axle: bool = True
-    is_switched: bool = False
+    bias: float  # sd of the difference of the torques over their sum
+    locked: bool  # the speeds are equal, and the torques differ by anything
+    is_open: bool  # the torques are equal but for friction
+    of_axle: bool = True  # the vehicle's differential lock acts on it
+    is_switched: bool = False  # a signal says whether it does
 
 
 class Row(NamedTuple):
@@ -77,18 +69,15 @@ class Row(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """Observations of N instants, in the order of the rows: torque, torque_var (N, W); nan where unknown.
+    """Observations of N instants, in the order of the rows; nan where unknown."""
 
-    value, variance (N, 2 W + 1): of loads, speeds and ground speed.  by_inertia, by_draft (N, 2 W + 1) [1]: how the
-    computed loads among them follow m (G sin(pitch) + dv/dt) and the draft as measured, whose noise is not in variance.
-    """
-
-    torque: Array
+    torque: Array  # (N, W)
     torque_var: Array
-    value: Array
+    value: Array  # (N, 2 W + 1) of loads, speeds and ground speed
     variance: Array
+    # (N, 2 W + 1) [1]: how computed loads follow m (G sin(pitch) + dv/dt), whose noise is not in `variance`
     by_inertia: Array
-    by_draft: Array
+    by_draft: Array  # as by_inertia, of the draft as measured
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
         """Return the observations of the given instants."""
@@ -166,8 +155,8 @@ def rows_of(
 ) -> tuple[tuple[Row, ...], tuple[str, ...]]:
     """Return W independent rows, channels first, and names (W,) of the raw window's columns.
 
-    A row that the rows before it imply adds nothing and is left out: a motor's speed beside those of its wheels.  The
-    raw window has a channel in the column of the first of its wheels that no channel of fewer wheels has.
+    A row that the rows before it imply is left out.  The raw window has a channel in the column of the first of its
+    wheels that no channel of fewer wheels has.
     """
     rows: list[Row] = []
     for group in channels:
@@ -182,18 +171,11 @@ def rows_of(
     for row in otherwise:
         if len(rows) < n_wheels and _independent(rows, np.array(row.weight)):
             rows.append(row)
-    return tuple(_placed(rows)), tuple(names)
-
-
-def _placed(rows: Sequence[Row]) -> list[Row]:
-    """The rows in an order in which each stands at the place of a wheel that it is of, those of one wheel first."""
-    free = list(range(len(rows)))
-    place: dict[int, Row] = {}
+    place: dict[int, Row] = {}  # each row at the place of a wheel that it is of, those of one wheel first
     for row in sorted(rows, key=lambda row: np.count_nonzero(row.weight)):
-        own = [i for i in free if row.weight[i]] or free
-        place[own[0]] = row
-        free.remove(own[0])
-    return [place[i] for i in range(len(rows))]
+        free = [i for i in range(len(rows)) if i not in place]
+        place[next((i for i in free if row.weight[i]), free[0])] = row
+    return tuple(place[i] for i in range(len(rows))), tuple(names)
 
 
 def _independent(rows: Sequence[Row], weight: Array) -> bool:
@@ -214,10 +196,10 @@ def unit(n_wheels: int, wheel: int) -> tuple[float, ...]:
 
 
 def completed(window: Window, rig: Rig) -> Window:
-    """Return a forward window (`forward`) with a torque, speed and load of every wheel.
+    """Return a forward window with a torque, speed and load of every wheel, and `observations` if there is need.
 
     Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
-    rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
+    rate that of the steering angle where none was.
     """
     window = _of_vehicle(window, rig)
     given = rig.instrumentation

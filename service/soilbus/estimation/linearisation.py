@@ -24,12 +24,7 @@ FIRST_GAIN = SOIL.stop
 
 
 class Layout(NamedTuple):
-    """Named slices of the residuals of W wheels.
-
-    rows of an instant (m): torques, balance, sinkages; latents (2 W + 1): loads, speeds, ground_speed.
-    columns: RESIDUAL | SOIL | sensor_columns | effect_columns; within `gains` (G,): sensors (torque_gains,
-    latent_gains in the order of the latents, draft_gain, standing as in `standing.STANDING`), then effects.
-    """
+    """Named slices of rows (m), latents (2 W + 1), gains (G,) and columns of W wheels, in this order."""
 
     torques: slice
     balance: int
@@ -38,7 +33,6 @@ class Layout(NamedTuple):
     loads: slice
     speeds: slice
     ground_speed: int
-    sensors: slice
     torque_gains: slice
     latent_gains: slice
     draft_gain: int
@@ -54,7 +48,7 @@ class Layout(NamedTuple):
         return cls(
             torques=wheels, balance=W, sinkages=slice(W + 1, None),
             n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
-            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
+            torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
             draft_gain=3 * W + 1, standing=slice(3 * W + 2, n_sensors), effects=slice(n_sensors, None),
             sensor_columns=slice(FIRST_GAIN, column),
             effect_columns=slice(column, None),

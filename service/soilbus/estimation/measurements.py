@@ -75,8 +75,7 @@ class Measurements:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
     Each has its variance and a mask of what is known; all are zero where it is not.  `standstill` and `turning` count
-    instants left out: up to min_speed [m/s], and with rim speeds of an axle that differ by more than max_turn of their
-    mean; reversing counts as driving forward.
+    instants left out: up to min_speed [m/s], and with rim speeds that differ by more than max_turn of their mean.
     """
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
@@ -100,19 +99,20 @@ class Measurements:
         self.usable = usable = usable[kept]
         self.n_wheels = n_wheels
 
-        def take(quantity: str) -> Masked:
-            value = getattr(window, quantity)[kept]
-            variance = window.variance[quantity][kept]
+        def masked(value: Array, variance: Array) -> Masked:
+            value, variance = value[kept], variance[kept]
             known = np.isfinite(value) & np.isfinite(variance)
             return np.where(known, value, 0.0), np.where(known, variance, 0.0), known
 
-        self.torque, self.torque_var, known = take("torque")
+        def take(quantity: str) -> Masked:
+            return masked(getattr(window, quantity), window.variance[quantity])
+
         self._observe()
         if window.observations is not None and self._torque_matrix is not None:
-            torque, torque_var = window.observations.torque[kept], window.observations.torque_var[kept]
-            known = np.isfinite(torque) & np.isfinite(torque_var)
-            self.torque, self.torque_var = np.where(known, torque, 0.0), np.where(known, torque_var, 0.0)
+            self.torque, self.torque_var, known = masked(window.observations.torque, window.observations.torque_var)
             usable = (~usable).astype(float) @ (np.abs(self._torque_matrix) > 0.0).T == 0.0
+        else:
+            self.torque, self.torque_var, known = take("torque")
         self.has_torque = known & usable
         torques, self._side_columns = [torque for torque, _ in self._sides], [load for _, load in self._sides]
         self._side_known = self.has_torque[:, torques]
@@ -148,10 +148,9 @@ class Measurements:
             self._measured = self._latents_measured
             self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
         else:
-            value, variance = window.observations.value[kept], window.observations.variance[kept]
-            known = np.isfinite(value) & np.isfinite(variance)
+            value, variance, known = masked(window.observations.value, window.observations.variance)
             self._measured = np.where(known, value, 1.0)
-            self._measured_var = np.where(known & ~self._of_free_wheels(), variance, 0.0)
+            self._measured_var = np.where(self._of_free_wheels(), 0.0, variance)
             self._measured_var[:, self._side_columns] *= ~self._side_known
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
@@ -233,14 +232,12 @@ class Measurements:
         self._from_observed: Array | None = None
         self._mass_gain: int | None = None
         self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
-        self._by_torques = np.zeros_like(self._prior_only)
         self._sides: tuple[tuple[int, int], ...] = ()
         if given is not None:
             self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
-            self._by_torques[: len(given.load)] = given.loads_by_torques
-            self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
-            self._prior_only &= ~self._by_torques
+            computed = np.array([row.kind != "channel" for row in given.load])
+            self._prior_only[: len(given.load)] = computed & ~given.loads_by_torques
             self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 

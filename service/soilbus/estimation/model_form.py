@@ -58,15 +58,11 @@ def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class FormPosterior:
-    """The form parameters after a window, and how soil and gains depend on them.
+    """The form parameters after a window, 0 being the configured form, and how soil and gains depend on them."""
 
-    by_form (6 + G, 4): derivatives of the soil's logarithms and of the gains by FORM; mean (4,) and covariance (4, 4)
-    of the form parameters, 0 being the configured form.
-    """
-
-    by_form: Array
-    mean: Array
-    covariance: Array
+    by_form: Array  # (6 + G, 4), derivatives of the soil's logarithms and of the gains by FORM
+    mean: Array  # (4,) of the form parameters
+    covariance: Array  # (4, 4)
 
     @classmethod
     def of(cls, farthest: Sequence[float], n_gains: int) -> FormPosterior:
@@ -150,10 +146,8 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
 
 
 def _discount(scores: Array, information: Array, problem: ObservationModel) -> float:
-    """Return how much more the scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least.
-
-    Scores are those of the form with soil and gains eliminated (covariance by blocks: Newey & West 1987).
-    """
+    """How much more scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least."""
+    # soil and gains are eliminated from the scores (covariance by blocks: Newey & West 1987)
     blocks = block_sums(scores, problem.t, problem.options.variance.block)
     variance = np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0]
     return max(float(np.trace(variance)) / len(information), 1.0)

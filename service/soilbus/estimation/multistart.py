@@ -113,9 +113,7 @@ def fit_warm(start: WarmStart) -> Fit | None:
             return None
         near = objective.stepped(start.iterate, model, step)
         return fit_at(
-            objective,
-            minimise(objective, near, objective.options.warm, model.squared_length(step)),
-            evaluations=1,
+            objective, minimise(objective, near, objective.options.warm, model.squared_length(step)), evaluations=1
         )
 
 

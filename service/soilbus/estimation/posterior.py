@@ -156,12 +156,6 @@ class Posterior:
         step = np.clip(logs, -prior.log_std, prior.log_std)
         return Posterior(Soil(*(np.asarray(self.soil) * np.exp(step)).tolist()), self.log_covariance)
 
-    def distance(self, soil: Soil) -> float:
-        """Return the Mahalanobis distance of a soil, in sd, by all free parameters together."""
-        free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
-        off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
-        return math.sqrt(max(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)), 0.0))
-
     def _estimate(self, scalar: Scalar) -> Estimate:
         return Estimate(scalar.value, self.propagate(scalar.gradient))
 

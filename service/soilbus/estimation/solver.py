@@ -108,17 +108,12 @@ class Objective:
     """-2 log posterior of a window: its residuals and those of its prior, with derivatives.
 
     The prior of the soil sets the free coordinates (F), joint_prior is of soil and gains for this window; ValueError
-    where it has no proper covariance. as_measured: the latents are held as measured, and the sensors' gains too; far
-    from the optimum they would absorb the residuals of a wrong soil.  Gains and effect parameters that are not held and
-    have a variance are active (A).
+    where it has no proper covariance.  Gains with a variance are active (A). as_measured: latents and sensors' gains
+    are held, which far from the optimum would absorb the residuals of a wrong soil.
     """
 
     def __init__(
-        self,
-        problem: ObservationModel,
-        prior: SoilPrior,
-        joint_prior: Gaussian,
-        as_measured: bool = False,
+        self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, as_measured: bool = False
     ) -> None:
         self.problem, self.joint_prior, self.options = problem, joint_prior, problem.options.search
         self.coordinates = coordinates_of(prior, problem.rig.mean_width, self.options)
@@ -405,8 +400,7 @@ def _solution(information: Array, right: Array) -> Array | None:
     """information^-1 right (F, M); None where the information is singular."""
     scale = 1.0 / np.sqrt(information.diagonal())
     try:
-        return np.asarray(
-            np.linalg.solve(information * scale[:, None] * scale, right * scale[:, None]) * scale[:, None]
-        )
+        solved = np.linalg.solve(information * scale[:, None] * scale, right * scale[:, None])
     except np.linalg.LinAlgError:
         return None
+    return np.asarray(solved * scale[:, None])

@@ -49,8 +49,8 @@ def standing_std(rig: Rig) -> list[float]:
     options: StandingOptions = rig.options.standing
     if rig.chassis is None:
         return [0.0] * len(STANDING)
-    return [options.relaxation_length, options.wheel_inertia, options.load, options.ground_speed, options.draft,
-            options.acceleration]  # fmt: skip
+    late = [options.load, options.ground_speed, options.draft, options.load]
+    return [options.relaxation_length, options.wheel_inertia, *late]
 
 
 def wheel_inertia(rig: Rig) -> Array:

@@ -115,19 +115,7 @@ class _Explanation(NamedTuple):
 class Tracker:
     """Recursive estimator over windows; it holds all state from window to window.
 
-    Parameters
-    ----------
-    rig : Rig
-        Wheels, geometry and sensor noise.
-    prior : SoilPrior
-        Configured prior of the soil.
-    model : WheelModel
-        Wheel-soil model without effects.
-    settings : Settings
-    effects : Sequence of Effect
-        Effects of the model.
-    free : Sequence of Free
-        Their parameters.
+    prior: the configured one of the soil; model: without effects; effects, free: of the model, and their parameters.
     """
 
     def __init__(
@@ -327,7 +315,7 @@ class Tracker:
         window, end = present.window, present.end
         first = self._problem(window.rows(np.flatnonzero(window.t < change.t - TIME_TOLERANCE)))
         warm = None
-        if one.warm is not None and self._fit is not None and first.n_rows >= self.options.min_rows_per_soil:
+        if one.warm is not None and self._fit is not None and first.n_rows >= self.settings.min_rows:
             warm = warm_start(first, self.soil_prior, self._fit, present.joint_prior)
         old = None if warm is None else fit_warm(warm)
         old = None if self.mismatch(old) else old
@@ -356,7 +344,7 @@ class Tracker:
             separated = without_transition(window, transition, self.rig.ahead)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
             arrived = transition.end + transition.lag if self._state.mismatch else transition.end
-            if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
+            if problem.n_rows < self.settings.min_rows or window.t[-1] < arrived:
                 return None  # after a mismatch both axles and the draft must agree on the new soil
             fit = self._search(problem, prior, joint_prior)
             if not self.mismatch(fit):

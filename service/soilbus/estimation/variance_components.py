@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import Row
 from soilbus.estimation.linearisation import RESIDUAL, Linearisation, Optimum
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import VarianceOptions
@@ -50,17 +49,17 @@ class VarianceComponents:
                 variance[quantity] = factor * variance[quantity]
         given, observations = rig.instrumentation, window.observations
         if given is not None and observations is not None:
-            torque = [self._of_row(row, "torque", "") for row in given.torque]
-            load = [self._of_row(row, "load", "computed_load") for row in given.load]
-            speed = [self._of_row(row, "speed", "") for row in given.speed]
+            torque, load, speed = (
+                [self.factor.get(measured if row.kind == "channel" else computed, 1.0) for row in rows]
+                for rows, measured, computed in (
+                    (given.torque, "torque", ""), (given.load, "load", "computed_load"), (given.speed, "speed", ""),
+                )
+            )  # fmt: skip
             latents = np.array([*load, *speed, self.factor.get("ground_speed", 1.0)])
             observations = observations._replace(
                 torque_var=observations.torque_var * torque, variance=observations.variance * latents
             )
         return replace(window, variance=variance, observations=observations)
-
-    def _of_row(self, row: Row, measured: str, computed: str) -> float:
-        return self.factor.get(measured if row.kind == "channel" else computed, 1.0)
 
     def after(self, found: Mapping[str, float], whole: bool = False) -> VarianceComponents:
         """Return the components after a window whose corrections are `found` times those expected; whole: replaced."""
@@ -68,7 +67,7 @@ class VarianceComponents:
         factor = dict(self.factor)
         for kind, ratio in found.items():
             old = factor.get(kind, 1.0)
-            factor[kind] = min(max(old * ratio**share, self.options.least), self.options.most)
+            factor[kind] = max(old * ratio**share, self.options.least)
         return replace(self, factor=factor, weight=self.weight + 1.0)
 
 
