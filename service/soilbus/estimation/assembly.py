@@ -283,7 +283,7 @@ def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> li
     for axle in rig.axles[1:-1]:
         alone = np.isin(np.arange(n), axle).astype(float)
         alone -= line.T @ np.linalg.lstsq(line.T, alone, rcond=None)[0]
-        name = "-".join(rig.wheels[i] for i in axle)
+        name = "share-" + "-".join(rig.wheels[i] for i in axle)
         rows.append(Row(tuple(alone.tolist()), "frame", axle[0], name, rig.options.measurements.axle_share))
     for axle in rig.axles:
         for one, other in pairwise(axle):

@@ -67,9 +67,8 @@ class Gaussian:
         return self._with_gains(at, kept * covariance @ (precision @ self.gains[at]), covariance)
 
     def given(self, at: NDArray[np.intp], gains: Array) -> Gaussian:
-        """Return the Gaussian where the gains at these places (K,) have these values (K,); held ones stay."""
-        free = np.diag(self.covariance)[_SOIL + at] > 0.0
-        return self._with_gains(at[free], gains[free], np.zeros((free.sum(),) * 2))
+        """Return the Gaussian where the gains at these places (K,) have these values (K,)."""
+        return self._with_gains(at, gains, np.zeros((len(at), len(at))))
 
     def _with_gains(self, at: NDArray[np.intp], gains: Array, covariance: Array) -> Gaussian:
         """The Gaussian with another mean (K,) and covariance (K, K) of the gains at these places."""

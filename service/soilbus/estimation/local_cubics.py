@@ -26,20 +26,16 @@ PHASE_PARTS = 16
 
 
 class Curve(NamedTuple):
-    """Values, slopes [1/s] and second derivatives [1/s^2] at ascending times t [s] (K,), cubics between them.
-
-    slope_gain [1/s^2]: variance of a slope over that of a sample.  step [s] is the median one; half_width the number of
-    samples on each side of a fitted cubic (0: not smoothed); parts the number of places of which it is the mean.
-    """
+    """Values, slopes [1/s] and second derivatives [1/s^2] at ascending times t [s] (K,), cubics between them."""
 
     t: Array
     value: Array
     slope: Array
     second: Array
-    slope_gain: Array
-    step: float
-    half_width: int
-    parts: int = 1
+    slope_gain: Array  # [1/s^2], variance of a slope over that of a sample
+    step: float  # [s], the median one
+    half_width: int  # number of samples on each side of a fitted cubic; 0: not smoothed
+    parts: int = 1  # number of places of which it is the mean
 
     def averaged(self, length: float, parts: int) -> Curve:
         """Return the curve of means over a length [s] about each time, by a number of places evenly spread over it."""
@@ -202,11 +198,6 @@ def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tup
     return own - np.mean([weights_of(i)[0] for i in range(n)], axis=0), value
 
 
-def powers(steps: Array) -> Array:
-    """Powers 1, s, s^2, s^3 (N, 4) of s (N,)."""
-    return np.asarray(steps[:, None] ** np.arange(4.0))
-
-
 def _hermite(u: Array, h: Array, value: Array, slope: Array, i: NDArray[np.intp]) -> Array:
     """Cubic Hermite interpolation from knot i to the next, h away, at shares u of h, all (N,)."""
     left, right, rise = slope[i], slope[i + 1], (value[i + 1] - value[i]) / h
@@ -218,7 +209,7 @@ def _hermite(u: Array, h: Array, value: Array, slope: Array, i: NDArray[np.intp]
 def _cubics(half: int) -> Array:
     """Weights of value and two derivatives at each of M samples (3, M, M)."""
     offsets = np.arange(-half, half + 1.0)
-    basis = powers(offsets)
+    basis = offsets[:, None] ** np.arange(4.0)
     fit = np.linalg.pinv(basis)
     by_step, twice = np.zeros(basis.shape), np.zeros(basis.shape)
     by_step[:, 1:] = basis[:, :3] * np.arange(1.0, 4.0)

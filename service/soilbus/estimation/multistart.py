@@ -81,8 +81,14 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
     options, objective = problem.options.search, Objective(problem, prior, joint_prior)
     thin = Objective(problem.thinned(options.thinned), prior, joint_prior, as_measured=True)
     with np.errstate(all="ignore"):
-        ends = _search(thin)
-        return _joint_fit(objective, ends[0]) if ends else None
+        end = _best_end(thin)
+        if end is None:
+            return None
+        start = objective.start(end.previous.soil, gains=end.previous.gains)
+        descent = options.cold
+        if not end.value < options.implausible * options.thinned:
+            descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
+        return fit_at(objective, minimise(objective, start, descent), end.evaluations)
 
 
 class WarmStart(NamedTuple):
@@ -135,11 +141,8 @@ def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
 
-def _search(thin: Objective) -> list[Solution[Iterate, WindowModel]]:
-    """Ends of descents of the soil alone on a few instants, the best first.
-
-    Descents from the starts in turn; two that meet at a plausible objective end the search.
-    """
+def _best_end(thin: Objective) -> Solution[Iterate, WindowModel] | None:
+    """Best end of the soil's descents on a few instants; two that meet at a plausible objective end the search."""
     options, ends = thin.options, list[Solution[Iterate, WindowModel]]()
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
         end = minimise(thin, thin.start(np.asarray(start)), options.soil_alone)
@@ -149,16 +152,7 @@ def _search(thin: Objective) -> list[Solution[Iterate, WindowModel]]:
         ends.append(end)
         if met and end.value < options.plausible_chi2 * thin.problem.n_rows:
             break
-    return sorted(ends, key=lambda end: end.value)
-
-
-def _joint_fit(objective: Objective, end: Solution[Iterate, WindowModel]) -> Fit | None:
-    """The fit to all instants from an end of the search; None where the numbers are not finite."""
-    options, start = objective.options, objective.start(end.previous.soil, gains=end.previous.gains)
-    descent = options.cold
-    if not end.value < options.implausible * options.thinned:
-        descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
-    return fit_at(objective, minimise(objective, start, descent), end.evaluations)
+    return min(ends, key=lambda end: end.value, default=None)
 
 
 def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluations: int = 0) -> Fit | None:

@@ -333,7 +333,7 @@ class ObservationModel(Measurements):
         `at` is the linearisation at `latents`, with derivatives by the sensor gains.
         """
         layout = self.layout
-        weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(self.n, 1, -1)
+        weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(self.n, 1, self._n_residuals)
         noise = self._off_curve
         if noise is None:
             noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]

@@ -91,15 +91,17 @@ class ObservationModelWithEffects(ObservationModel):
         standardised = gains[self.layout.effects]
         active = active_with_derivatives(self.effects, self.free, standardised, self.n_wheels)
         varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
-        wheels = self._wheels(_varied(soil), active, varied, varied.entry_angle)
-        contact = self._contact(wheels, active, forces_along(wheels.state, wheels.model))
-        excess, (_, drawbar, torque) = self._excess_load(contact, active, varied), contact.forces
+        # the derivative by k_c is that by k_phi over the width
+        varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
+        wheels = self._wheels(soil._replace(**varied_soil), active, varied, varied.entry_angle)
+        forces = reactions_with(active, forces_along(wheels.state, wheels.model), wheels.state, wheels.surroundings)
+        excess, (_, drawbar, torque) = self._excess_load(forces, wheels, active, varied), forces
         for effect, values in active:
             if effect.torque is not None:
-                torque = effect.torque(torque, contact.surroundings, values)
-        pull = self._extra_pull(contact.forces[1].only(int), active, self._surroundings(latents))
+                torque = effect.torque(torque, wheels.surroundings, values)
+        pull = self._extra_pull(drawbar.only(int), active, self._surroundings(latents))
         at, by_latents, by_soil, by_effects = _gathered(
-            (excess, drawbar, torque, contact.depth), len(self.free), (self.n, self.n_wheels)
+            (excess, drawbar, torque, wheels.depth), len(self.free), (self.n, self.n_wheels)
         )
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
         pull_by_effects = np.zeros((len(self.free), self.n))
@@ -138,17 +140,12 @@ class ObservationModelWithEffects(ObservationModel):
         state, model = wheel_with(active, state, self.model, surroundings)
         return _Wheels(state, model, sinkage(angle, state.radius), surroundings)
 
-    def _contact(self, wheels: _Wheels, active: Sequence[Active], forces: Forces) -> _Contact:
-        """Contact of wheels and ground, from the integrated forces."""
-        forces = reactions_with(active, forces, wheels.state, wheels.surroundings)
-        return _Contact(forces, wheels.depth, wheels.surroundings)
-
-    def _excess_load(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> Any:
+    def _excess_load(self, forces: Forces, wheels: _Wheels, active: Sequence[Active], latents: Latents) -> Any:
         """Load [N] (N, W) that the soil carries in excess of the latent load."""
-        excess = contact.forces[0] - latents.load
+        excess = forces[0] - latents.load
         for effect, values in active:
             if effect.load is not None:
-                excess = excess + effect.load(contact.surroundings, values)
+                excess = excess + effect.load(wheels.surroundings, values)
         return excess
 
     def _extra_pull(self, pull: Dual, active: Sequence[Active], surroundings: Surroundings) -> Any:
@@ -252,8 +249,9 @@ class ObservationModelWithEffects(ObservationModel):
 
         def excess(angle: Array) -> Array:
             wheels = self._wheels(soil, active, base, angle)
-            contact = self._contact(wheels, active, wheel_forces(wheels.state, wheels.model))
-            return np.asarray(self._excess_load(contact, active, base))
+            free_of_effects = wheel_forces(wheels.state, wheels.model)
+            forces = reactions_with(active, free_of_effects, wheels.state, wheels.surroundings)
+            return np.asarray(self._excess_load(forces, wheels, active, base))
 
         off = excess(angle)
         with np.errstate(all="ignore"):
@@ -287,14 +285,6 @@ class ObservationModelWithEffects(ObservationModel):
         return wheels.state, wheels.model
 
 
-class _Contact(NamedTuple):
-    """Load [N], drawbar pull [N] and torque [N m] between wheels and ground, sinkage [m] (N, W), surroundings."""
-
-    forces: Forces
-    depth: Any
-    surroundings: Surroundings
-
-
 class _Wheels(NamedTuple):
     """Wheel states and model after the effects' `wheel` hooks, sinkages [m] (N, W), surroundings."""
 
@@ -318,9 +308,3 @@ def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) 
             else:
                 by_soil[i, _SOIL_NAMES.index(quantity)] = d
     return at, by_latents, by_soil, by_effects
-
-
-def _varied(soil: Soil) -> Soil:
-    """The soil with derivatives by each parameter but k_c, whose derivative is that of k_phi over the width."""
-    varied = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
-    return soil._replace(**varied)  # type: ignore[arg-type]
