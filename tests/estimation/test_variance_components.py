@@ -80,13 +80,14 @@ def test_factors_scale_the_variances_of_their_own_quantities(drive):
         assert variance == pytest.approx(times.get(quantity, 1.0) * before[quantity], nan_ok=True), quantity
 
 
-def test_factors_are_geometric_means_above_the_least():
-    options = replace(ESTIMATOR.variance, memory=4.0, least=0.5)
+def test_factors_are_geometric_means_within_their_bounds():
+    options = replace(ESTIMATOR.variance, memory=4.0, least=0.5, most=8.0)
     components = VarianceComponents(options)
     for ratio in (2.0, 0.5, 2.0):
         components = components.after({"draft": ratio})
     assert components.weight == 3.0
     assert components.factor["draft"] == pytest.approx(2.0 * 0.5 ** (1 / 2) * 2.0 ** (1 / 3))
+    assert components.after({"draft": 1e9}, whole=True).factor["draft"] == 8.0
     assert components.after({"draft": 1e-9}, whole=True).factor["draft"] == 0.5
 
 

@@ -187,6 +187,9 @@ class VarianceOptions:
     """Windows [1] over which factors are averaged, one a hop: half a minute of the same ground."""
     least: float = 0.25
     """Least factor on a variance [1]: sensors twice as good as their data sheets say."""
+    most: float = 400.0
+    """Largest factor on a variance [1]: twenty times the sd of a data sheet, as loads that shake by 12 % have beside
+    cells of 0.8 %.  Without it torques of the wrong sign count as noise."""
     least_share: float = 0.02
     """Share of its own noise [1] an instant that corrections of a kind must show for its factor to be learned."""
 

@@ -67,7 +67,7 @@ class VarianceComponents:
         factor = dict(self.factor)
         for kind, ratio in found.items():
             old = factor.get(kind, 1.0)
-            factor[kind] = max(old * ratio**share, self.options.least)
+            factor[kind] = min(max(old * ratio**share, self.options.least), self.options.most)
         return replace(self, factor=factor, weight=self.weight + 1.0)
 
 

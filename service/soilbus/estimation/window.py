@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -57,52 +56,37 @@ has its resolution and its zero error.  No evidence recorded."""
 
 
 class SensorNoise(NamedTuple):
-    """Noise of a channel.
+    """Noise of a channel; the first three add in quadrature."""
 
-    absolute: sd of a sample in SI; relative: sd over its value; of_mean: sd over the channel's
-    mean magnitude in the window; the three add in quadrature.  gain: sd of a constant relative gain error.
-    """
-
-    absolute: float = 0.0
-    relative: float = 0.0
-    of_mean: float = 0.0
-    gain: float = 0.0
+    absolute: float = 0.0  # sd of a sample in SI
+    relative: float = 0.0  # sd over its value
+    of_mean: float = 0.0  # sd over the channel's mean magnitude in the window
+    gain: float = 0.0  # sd of a constant relative gain error
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The vehicle or test rig: W wheels, their geometry, the sensors' noise.
-
-    radius and width [m] have shape (W,); ahead (W,) is the distance to the last axle over the wheelbase, 1 on the front
-    axle; chassis is None for a test rig, whose drawbar pull is measured as draft.
-    """
+    """The vehicle or test rig: W wheels, their geometry, the sensors' noise."""
 
     wheels: tuple[str, ...]
-    radius: Array
+    radius: Array  # (W,) [m], as width
     width: Array
-    ahead: Array
-    chassis: Chassis | None
+    ahead: Array  # (W,), distance to the last axle over the wheelbase: 1 on the front axle
+    chassis: Chassis | None  # None for a test rig, whose drawbar pull is measured as draft
     noise: Mapping[str, SensorNoise]
-    track: float | None = None
-    """Distance [m] between the left and the right wheels, where known."""
-    driven: NDArray[np.bool_] | None = None
-    """(W,), which wheels a motor can drive; None for all."""
+    track: float | None = None  # distance [m] between the left and the right wheels, where known
+    driven: NDArray[np.bool_] | None = None  # (W,), which wheels a motor can drive; None for all
+    # what is measured, where that is not a torque, a speed and a load of each wheel
     instrumentation: Instrumentation | None = None
-    """What is measured, where that is not a torque, a speed and a load of each wheel."""
+    # names (W,) of a quantity's columns in the raw window, where these are not the wheels'
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Names (W,) of a quantity's columns in the raw window, where these are not the wheels'."""
-    towing: str = "measured"
-    """As `config.model.Vehicle.towing`."""
-    specific_force: bool = False
-    """Whether the accelerometer measures dv/dt + g sin(pitch)."""
+    towing: str = "measured"  # as `config.model.Vehicle.towing`
+    specific_force: bool = False  # whether the accelerometer measures dv/dt + g sin(pitch)
+    # of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed
     max_lateral: float | None = None
-    """Of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed."""
-    lengths: Array | None = None
-    """(W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels."""
-    mass_std: float = 0.0
-    """Relative sd of the mass in `chassis` [1], as far as decisions count it."""
+    lengths: Array | None = None  # (W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels
+    mass_std: float = 0.0  # relative sd of the mass in `chassis` [1], as far as decisions reckon with it
     options: EstimatorOptions = ESTIMATOR
-    """Tuning values of its estimator."""
 
     @property
     def mean_width(self) -> float:
@@ -131,7 +115,8 @@ class Rig:
     @property
     def axles(self) -> list[list[int]]:
         """The wheels of each axle, from the front to the rear."""
-        return [np.flatnonzero(self.ahead == at).tolist() for at in np.unique(self.ahead)[::-1]]
+        ahead = self.ahead.tolist()
+        return [[i for i, at in enumerate(ahead) if at == axle] for axle in sorted(set(ahead), reverse=True)]
 
     @property
     def drives(self) -> NDArray[np.bool_]:
@@ -163,12 +148,10 @@ class Window:
     roll: Array = field(default_factory=lambda: np.empty(0))
     steering_angle: Array = field(default_factory=lambda: np.empty(0))
     differential_lock: Array = field(default_factory=lambda: np.empty(0))
+    # (N,), -1 where the vehicle reversed before `forward`; empty where it never did
     direction: Array = field(default_factory=lambda: np.empty(0))
-    """(N,), -1 where the vehicle reversed before `forward`; empty where it never did."""
-    observations: Observations | None = None
-    """Of `instrumentation.completed`."""
-    kinematic: bool = False
-    """Whether an acceleration that was a specific force has become dv/dt."""
+    observations: Observations | None = None  # of `instrumentation.completed`
+    kinematic: bool = False  # whether an acceleration that was a specific force has become dv/dt
 
     def __post_init__(self) -> None:
         for quantity in ("yaw_rate", "roll", "steering_angle", "differential_lock"):
@@ -292,13 +275,7 @@ def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:
 
 def pairs(rig: Rig) -> NDArray[np.intp]:
     """Return the left and right wheels (2, P) of the axles that have two; the left one is configured first."""
-    return _pairs(tuple(rig.ahead.tolist()))
-
-
-@cache
-def _pairs(ahead: tuple[float, ...]) -> NDArray[np.intp]:
-    axles = [[i for i, at in enumerate(ahead) if at == axle] for axle in sorted(set(ahead), reverse=True)]
-    return np.array([wheels for wheels in axles if len(wheels) == 2], np.intp).reshape(-1, 2).T
+    return np.array([wheels for wheels in rig.axles if len(wheels) == 2], np.intp).reshape(-1, 2).T
 
 
 class NoiseTable(NamedTuple):
