@@ -3,9 +3,8 @@
     Q(k) = min over d of  sum_{i >= k} |r_i + J_i d|^2_{S_i^-1} + d' H d          H information of the predicted soil
     GLR(k) = n_k / 2 (q - 1 - log q),    q = max(Q(k) / n_k, 1)                     n_k residuals from instant k on
 
-A generalised log likelihood ratio over the instant k of change (GLR; Basseville & Nikiforov, Detection of Abrupt
-Changes, 1993, ch. 2): residuals larger than noise against noise alone, after the part that the predicted
-soil explains within its covariance (step d) is removed.  The likeliest k is where a new soil may begin.
+A generalised log likelihood ratio over the instant k of change (Basseville & Nikiforov, Detection of Abrupt Changes,
+1993, ch. 2), after the part that the predicted soil explains within its covariance (step d) is removed.
 
 The threshold h follows from a false-alarm probability: where the m last instants, of r residuals each, are noise,
 

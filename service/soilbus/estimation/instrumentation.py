@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window, pairs, steady, zero_if_unknown
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, wheel_loads
+from soilbus.terra.vehicle import GRAVITY, axle_loads, wheel_loads
 
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
@@ -205,9 +205,14 @@ def completed(window: Window, rig: Rig) -> Window:
     given = rig.instrumentation
     if given is None or window.observations is not None or not len(window.t):
         return window
-    load_of, load_var, load_read, by_inertia, by_draft = _loads(window, rig, given)
+    zero = np.zeros(len(window.t))
+    readings = [window.torque[:, row.at] if row.kind == "channel" else zero for row in given.torque]
+    torque_read = np.stack(readings, axis=1)
+    torque = _combined(torque_read, inverse(given.torque))  # differentials share equally
+    load_of, load_var, load_read, by_inertia, by_draft = _loads(window, rig, given, torque)
     speed_of, speed_var = _speeds(window, rig, given)
-    torque, torque_of, torque_var = _torques(window, given)
+    torque_var = _torque_variances(window, given, torque)
+    torque_of = np.where(np.isfinite(torque_var), torque_read, np.nan)
     observations = Observations(
         torque_of,
         torque_var,
@@ -283,7 +288,8 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
         changed["draft"] = np.zeros(len(window.t))
         weight = 0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY
         slope = rig.options.measurements.unknown_slope
-        variance["draft"] = np.where(_shows_slope(window, rig), 0.0, (slope * weight) ** 2)
+        shown = np.isfinite(window.pitch) | (np.isfinite(window.acceleration) & rig.specific_force)
+        variance["draft"] = np.where(shown, 0.0, (slope * weight) ** 2)
     if rig.specific_force and not window.kinematic:
         changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(steady(window).pitch))
     if rig.chassis is not None and np.isfinite(window.steering_angle).any() and not np.isfinite(window.yaw_rate).any():
@@ -305,7 +311,7 @@ def _combined(values: Array, weight: Array) -> Array:
     return np.asarray(sums)
 
 
-def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array, Array, Array]:
+def _loads(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Observations of loads, their variances, what the rows read, and what they follow as in `Observations` (N, W)."""
     n, W, window, chassis = len(window.t), len(given.load), steady(window), rig.chassis
     load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
@@ -325,13 +331,14 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             load[:, i] = scale[:, i] + _heave(window, rig, given)
         elif row.kind == "transfer":
             along = direction * pitch, direction * zero_if_unknown(window.acceleration)
-            draft, draft_var = _draft_on_hitch(window, rig, given, chassis)
+            draft, draft_var = _draft_on_hitch(window, rig, given, torque)
             front, rear = axle_loads(chassis, direction * draft, *along)
             share = static / weight
             load[:, i] = (1.0 - share) * front - share * rear
             scale[:, i] = static
             by_inertia[:, i] = -direction * chassis.cg_height / chassis.wheelbase
-            by_inertia[~_knows_inertia(window, rig), i] = 0.0
+            knows_slope = np.isfinite(window.pitch) | rig.specific_force
+            by_inertia[~(np.isfinite(window.acceleration) & knows_slope), i] = 0.0
             by_draft[:, i] = -direction * np.isfinite(window.draft) * chassis.hitch_height / chassis.wheelbase
             of_pitch = np.where(by_inertia[:, i] == 0.0, GRAVITY**2 * _known_var(window, "pitch"), 0.0)
             variance[:, i] = (
@@ -371,28 +378,17 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))
 
 
-def _shows_slope(window: Window, rig: Rig) -> NDArray[np.bool_]:
-    """At which instants (N,) a sensor feels the slope."""
-    return np.isfinite(window.pitch) | (np.isfinite(window.acceleration) & rig.specific_force)
-
-
-def _knows_inertia(window: Window, rig: Rig) -> NDArray[np.bool_]:
-    """At which instants (N,) acceleration, and pitch where it counts beside it, are measured."""
-    known = np.isfinite(window.acceleration)
-    return known if rig.specific_force else known & np.isfinite(window.pitch)
-
-
 def unknown_draft(most: Any) -> tuple[Any, Any]:
     """Return mean and sd [N] of a draft that is anywhere from 0 to its bound."""
     return most / 2.0, most / math.sqrt(12.0)
 
 
-def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, chassis: Chassis) -> tuple[Array, Array]:
+def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> tuple[Array, Array]:
     """Draft [N] for the loads, and its variance: where none is measured, at most what the wheels' torques leave it."""
-    known, most = np.isfinite(window.draft), rig.options.measurements.largest_draft * chassis.mass * GRAVITY
-    thrust = (_shares(window, given) / rig.radius).sum(axis=1)
+    mass = 0.0 if rig.chassis is None else rig.chassis.mass
+    known, most = np.isfinite(window.draft), rig.options.measurements.largest_draft * mass * GRAVITY
     along = zero_if_unknown(window.acceleration) + GRAVITY * np.sin(zero_if_unknown(window.pitch))
-    left = np.clip(thrust - chassis.mass * along, 0.0, most)
+    left = np.clip((torque / rig.radius).sum(axis=1) - mass * along, 0.0, most)
     is_measured = np.isfinite(left) & all(row.kind != "unknown" for row in given.torque)
     mean, std = unknown_draft(np.where(is_measured, left, most))
     return np.where(known, window.draft, mean), np.where(known, _known_var(window, "draft"), std**2)
@@ -422,9 +418,8 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
     return speed, variance
 
 
-def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Array]:
-    """Torques of the wheels, observations of them and their variances, each (N, W); nan where a row says nothing."""
-    torque, shares = _torque_readings(window, given), _shares(window, given)
+def _torque_variances(window: Window, given: Instrumentation, torque: Array) -> Array:
+    """Variances of the rows of torques (N, W), by torques of the wheels (N, W); nan where a row says nothing."""
     variance = np.zeros_like(torque)
     for i, row in enumerate(given.torque):
         if row.kind == "channel":
@@ -433,21 +428,10 @@ def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Arra
             variance[:, i] = np.nan
         else:
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
-            size = np.abs(zero_if_unknown(shares)) @ weight
+            size = np.abs(zero_if_unknown(torque)) @ weight
             may_be_locked = _locked(window, coupling) | (coupling.is_switched & np.isnan(window.differential_lock))
             variance[:, i] = np.where(may_be_locked, np.nan, (coupling.bias * size) ** 2)
-    return shares, np.where(np.isfinite(variance), torque, np.nan), variance
-
-
-def _torque_readings(window: Window, given: Instrumentation) -> Array:
-    """What the rows of torques (N, W) read; 0 where no channel does."""
-    zero = np.zeros(len(window.t))
-    return np.stack([window.torque[:, r.at] if r.kind == "channel" else zero for r in given.torque], axis=1)
-
-
-def _shares(window: Window, given: Instrumentation) -> Array:
-    """Torques of the wheels (N, W) where differentials share them equally."""
-    return _combined(_torque_readings(window, given), inverse(given.torque))
+    return variance
 
 
 def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:

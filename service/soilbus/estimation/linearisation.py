@@ -70,10 +70,6 @@ class Latents(NamedTuple):
     ground_speed: Array
     entry_angle: Array
 
-    def followed_by(self, shared: int, new: Latents) -> Latents:
-        """The last `shared` instants of these, followed by `new`."""
-        return Latents(*[np.concatenate([own[-shared:], other]) for own, other in zip(self, new, strict=True)])
-
     def joined(self) -> Array:
         """Loads, speeds and ground speed (N, 2 W + 1)."""
         return np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)

@@ -7,9 +7,8 @@ prior) and the Gaussian there,
     -2 log evidence = -2 log posterior(mode) + log det H - log det H_prior          (Laplace)
 
 `fit_window` finds it where nothing is known: the soil alone descends on a few instants, with loads and speeds as
-measured, from the prior's median, loam and the likeliest soils of the table until two descents meet; from the best end
-soil, gains and latents descend together on all instants.  `fit_warm` starts at the optimum of the window before.
-All return a `Fit`.
+measured, from several soils until two descents meet; from the best end soil, gains and latents descend together on all
+instants.  `fit_warm` starts at the optimum of the window before.
 """
 
 from __future__ import annotations

@@ -15,12 +15,10 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 
     r <- r + A (x_measured / (1 + g_x) - x),    covariance  S = A V A' + R,    chi-square = sum r' S^-1 r.
 
-A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
-(`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
-two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
-pull are curved in the load, so that unequal loads held equal bias the soil.  Behind an open differential equal torques
-and unequal slips say how they differ: T_left(W_left) = T_right(W_right) fixes the difference, as T = 0 fixes the slip
-of a free wheel, and that row is used up.
+A load that is computed stays at its prior; what it leaves open, A V A', is a weight that models share
+(`with_weights_at`), and its noise by draft and inertia is that of the balance.  The difference left to right of two
+wheels on a load cell of the axle, with a torque sensor each, is fitted: unequal loads held equal bias the soil.  Behind
+an open differential T_left(W_left) = T_right(W_right) fixes it, as T = 0 fixes the slip of a free wheel.
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`, columns and
 rows as in `Layout`).  `observation_with_effects` adds effects to the wheel-soil model.
@@ -66,10 +64,9 @@ from soilbus.terra.wheel import (
 class ObservationModel(Measurements):
     """One window's measurements and the wheel-soil model; `linearise` gives residuals and derivatives at any soil.
 
-    min_speed: ground speed [m/s] up to which instants are left out; max_turn: relative difference of an axle's rim
-    speeds above which they are, as in `config.model.Estimator`.  The nuisance parameters, `gains` (G,) throughout, are
-    the sensors' relative gain errors in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) are
-    the lowest and the highest values, infinite where there is none. `work` counts evaluations.
+    min_speed, max_turn: as in `config.model.Estimator`.  The nuisance parameters, `gains` (G,), are the sensors'
+    relative gain errors in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) may be infinite.
+    `work` counts evaluations.
     """
 
     def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = 0.15) -> None:
@@ -244,7 +241,13 @@ class ObservationModel(Measurements):
             return np.zeros((self.n, 0))
         ratio = latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        return rolling_step(1.0 - ratio, at.value[1][:, free], by_slip, self.options.measurements.max_rolling_skid)
+        torque, limit = (
+            at.value[1][:, free],
+            0.05,
+        )  # in one step: the torque is curved within K over the contact's length
+        step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
+        most = self.options.measurements.max_rolling_skid
+        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
@@ -489,7 +492,8 @@ class ObservationModel(Measurements):
         slip_change = (old.ground_speed[:, None] / old.speed)[near] - ground[:, None] / speed
         more = load - old.load[near] + at.load_residual[near] - at.load_by_slip[near] * slip_change / self.rig.radius
         angle = near_angle(old.entry_angle[near], more / at.load_slope[near])
-        return old.followed_by(shared, Latents(load, speed, ground, angle))
+        new = Latents(load, speed, ground, angle)
+        return Latents(*[np.concatenate([own[-shared:], other]) for own, other in zip(old, new, strict=True)])
 
     def _shared(self, t: Array) -> int:
         """Number of first instants that are the last ones of times t (M,) [s]."""
@@ -500,13 +504,6 @@ class ObservationModel(Measurements):
 def near_angle(angle: Array, step: Array) -> Array:
     """Return entry angles [rad] after a step of the linear model, a factor within 0.6 and 1.6."""
     return np.asarray(np.clip(angle + step, angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)))
-
-
-def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Array:
-    """Slips (N, F) of free wheels after one Newton step towards zero torque [N m]; most: greatest skid [1]."""
-    limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
-    step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
-    return np.asarray(np.clip(slip + np.clip(step, -limit, limit), -most, 0.0))
 
 
 def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array | None = None) -> Array:

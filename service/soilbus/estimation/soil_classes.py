@@ -7,11 +7,9 @@ Equations.  Class i has probability p_i beforehand and soils x ~ N(m_i, S_i) in 
 
 where D, y and V are the information of the posterior minus that of the part of the prior that is only a guess.
 
-A class is a soil of the table with a spread, because no field has exactly the soil of a table.  The spread of
-each row has not been measured, so all have the same one, from repeated measurements (WITHIN_CLASS_SD).
-`unknown` is a soil of another kind, spread as widely as the rows of the table are about their mean.  Held
-parameters are left out, and so is k_c: a window determines at best that it is not large, which no Gaussian of
-its logarithm can say.
+A class is a soil of the table with the spread of repeated measurements (WITHIN_CLASS_SD); `unknown` is spread as widely
+as the rows of the table are about their mean.  Held parameters are left out, and so is k_c: a window determines at best
+that it is not large.
 """
 
 from __future__ import annotations

@@ -79,9 +79,7 @@ class SoilState:
 class Shown(NamedTuple):
     """What a window tells of a change of soil."""
 
-    # why data before the end of `transition` are of another soil than those after it, or before `change` than those
-    # after it; None where they are of the soil of the window before
-    found: Reason | None
+    found: Reason | None  # why its newest data are of another soil than that of the window before; None if of the same
     transition: Transition | None  # the last transition, found now or before
     change: ChangePoint | None  # the change point, where there is one
     mismatch: bool  # whether the fit exceeds its limit of chi-square

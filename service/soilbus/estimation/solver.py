@@ -9,12 +9,9 @@ covariance, p the residuals of the prior and P its precision,
     step          H d = -g,   subject to the active bounds
     decrease      of F, predicted for a full step: D = d' H d, its squared length in posterior sd
 
-`Objective` evaluates residuals, Jacobian and prior at an `Iterate` and returns the `QuadraticModel` there.  `minimise`
-is the loop: step, evaluate, accept or reject.  `SolverOptions` holds its numbers, `Termination` says why it ended.
-
 The latents (loads and speeds of each instant) are eliminated from the linear model.  In an objective `as_measured`
-they are held, and F is a function of theta that must fall at each step.  Otherwise they follow each step as the linear
-model predicts, one linearisation late, so that F may rise before it falls further.
+they are held, and F must fall at each step.  Otherwise they follow each step one linearisation late, so that F may rise
+before it falls further.
 """
 
 from __future__ import annotations
@@ -138,8 +135,6 @@ class Objective:
         """Return the same window under another joint prior."""
         return Objective(self.problem, self.coordinates.prior, joint_prior)
 
-    # Iterates
-
     def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
         """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's, with the latents as measured.
 
@@ -206,8 +201,6 @@ class Objective:
         bounds[: len(of_soil), : len(self.free)] = of_soil
         bounds[len(of_soil) + np.arange(len(own)), len(self.free) + own] = sides[own]
         return bounds
-
-    # Residuals, Jacobian, prior: the quadratic model
 
     def quadratic_model(self, iterate: Iterate) -> WindowModel | None:
         """Return the quadratic model at an iterate; None where the observation model is not finite there."""

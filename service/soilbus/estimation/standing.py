@@ -5,11 +5,7 @@
     torque     T = T_soil + J domega/dt                          inertia J of a wheel
     channel    y(t) = x(t - d),   x = y + d dy/dt                d: lateness beside torque and wheel speed
 
-Each parameter is one more gain with a prior of mean 0.  What it changes is linearised at 0, as L / V and d are short
-beside a second.  Its posterior is the prior of the next window.
-
-References
-----------
+Each parameter is one more gain with a prior of mean 0, linearised at 0, as L / V and d are short beside a second.
 Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness: Ljung, System Identification (1999).
 """
 

@@ -7,9 +7,8 @@ With e = S^-1 r the weighed residuals of an instant and A their derivatives by t
     factor       f = sum over blocks of (sum of v / sqrt V)^2  /  sum of shares           blocks of one second
 
 so that f V is the variance that corrections of this kind have in the mean over a second (Foerstner 1979, Allg. Verm.
-Nachr. 86:446; blocks: Newey & West 1987, Econometrica 55:703).  Errors that follow each other, of the model or of a
-machine that shakes, so have the weight of few independent ones.  The factor is never less than that of single
-instants: noise that averages out within a second is still in each instant's loads and speeds.
+Nachr. 86:446; blocks: Newey & West 1987, Econometrica 55:703).  The factor is never less than that of single instants:
+noise that averages out within a second is still in each instant's loads and speeds.
 """
 
 from __future__ import annotations
