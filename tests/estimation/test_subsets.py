@@ -9,7 +9,7 @@ import pytest
 
 from cramer_rao import cramer_rao
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior, tyre_modulus
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.soils import SOILS
 
 CLAY = SOILS["wet_clay"]
@@ -124,19 +124,3 @@ def test_equal_widths_leave_k_c_at_its_prior(fits):
         own, narrow = (posterior.bearing_pressure(0.1, width) for width in (0.35, 0.10))
         assert own.std / own.value < 0.03
         assert narrow.std / narrow.value > 0.1
-
-
-def test_moduli_of_two_tyres_give_k_c_and_k_phi_as_in_the_paper(fits):
-    # Eqs. 35-39: k_c = (K_L1 - K_L2) / (1/b1 - 1/b2), k_phi = K_L1 - k_c/b1; with covariance, since both are linear.
-    b1, b2 = WIDTHS["unlike"]
-    for _, posterior in fits["unlike"]:
-        of_tyres = [tyre_modulus(posterior.soil, width) for width in (b1, b2)]
-        by_logs = np.array([one.gradient for one in of_tyres]) * np.asarray(posterior.soil)
-        moduli, covariance = np.array([one.value for one in of_tyres]), by_logs @ posterior.log_covariance @ by_logs.T
-        of_k_c = np.array([1.0, -1.0]) / (1.0 / b1 - 1.0 / b2)
-        of_k_phi = np.array([1.0, 0.0]) - of_k_c / b1
-        for name, weights in (("k_c", of_k_c), ("k_phi", of_k_phi)):
-            value, i = getattr(posterior.soil, name), PARAMETERS.index(name)
-            std = value * np.sqrt(posterior.log_covariance[i, i])
-            assert weights @ moduli == pytest.approx(value, rel=1e-9)
-            assert np.sqrt(weights @ covariance @ weights) == pytest.approx(std, rel=1e-6)

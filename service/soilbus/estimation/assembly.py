@@ -46,25 +46,10 @@ UNKNOWN_SHARE = 0.02
 
 
 def rig_of(config: Config, options: EstimatorOptions = ESTIMATOR) -> Rig:
-    """Return the vehicle with all its wheels, or a test rig with one.
+    """Return the vehicle with all its wheels, or a test rig with one; without wheels if no torque is measured.
 
-    Parameters
-    ----------
-    config : Config
-        Validated configuration.
-    options
-        Of the estimator.
-
-    Returns
-    -------
-    Rig
-        Without wheels if no torque is measured.
-
-    Raises
-    ------
-    ConfigError
-        With a line for each wheel whose motor or speed is not measured while others are, and for each axle without
-        wheels: its rolling resistance would be attributed to the soil under the others.
+    ConfigError with a line for each wheel whose motor or speed is not measured while others are, and for each axle
+    without wheels: its rolling resistance would be attributed to the soil under the others.
     """
     of_table = config.table is not None
     if faults := [] if of_table else list(_unmeasured(config)):
@@ -153,16 +138,12 @@ def _unmeasured(config: Config) -> Iterator[str]:
 
 
 class Motor(NamedTuple):
-    """Motor by the name of its wheel or axle: the wheels that it drives, each one's part of the torque, and
-
-    max_torque [N m] at the wheel or the axle, nan where not known.  share: torque of each wheel for one unit of the
-    motor's, where all slip alike.
-    """
+    """Motor by the name of its wheel or axle, and the wheels that it drives."""
 
     name: str
     wheels: tuple[int, ...]
-    share: tuple[float, ...]
-    max_torque: float
+    share: tuple[float, ...]  # torque of each wheel for one unit of the motor's, where all slip alike
+    max_torque: float  # [N m] at the wheel or the axle, nan where not known
 
 
 class Motors(NamedTuple):
@@ -284,11 +265,8 @@ def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: S
 
 
 def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> list[Row]:
-    """Weight, its share on the front axle, what an axle between carries beside the line of the others, and the
-    differences left to right, a share of each axle's load; side: sd.
-
-    A draft that nothing measures shifts load in all of a window: it counts with the centre of gravity.
-    """
+    """Weight, transfer to the front axle, axles between beside the others' line, and left less right; side: sd."""
+    # a draft that nothing measures shifts load in all of a window: it is part of the centre of gravity's sd
     n, chassis = len(rig.wheels), rig.chassis
     assert chassis is not None
     mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
@@ -296,21 +274,16 @@ def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> li
     share = chassis.cg_ahead_of_rear_axle / chassis.wheelbase
     transfer = rig.ahead - share
     shifted = 0.0 if knows_draft else unknown_draft(rig.options.measurements.largest_draft)[1] * chassis.hitch_height
+    balance_std = math.hypot(cg_std, shifted) / chassis.cg_ahead_of_rear_axle
     rows = [
         Row((1.0,) * n, "weight", 0, "weight", mass_std),
-        Row(
-            tuple(transfer.tolist()),
-            "transfer",
-            0,
-            "balance",
-            math.hypot(cg_std, shifted) / chassis.cg_ahead_of_rear_axle,
-        ),
+        Row(tuple(transfer.tolist()), "transfer", 0, "balance", balance_std),
     ]
     line = np.stack([np.ones(n), rig.ahead])
     for axle in rig.axles[1:-1]:
         alone = np.isin(np.arange(n), axle).astype(float)
         alone -= line.T @ np.linalg.lstsq(line.T, alone, rcond=None)[0]
-        name = "-".join(rig.wheels[i] for i in axle)
+        name = "share-" + "-".join(rig.wheels[i] for i in axle)
         rows.append(Row(tuple(alone.tolist()), "frame", axle[0], name, rig.options.measurements.axle_share))
     for axle in rig.axles:
         for one, other in pairwise(axle):
@@ -348,19 +321,9 @@ def form_of(config: Config) -> tuple[float, ...]:
 def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Active, ...]:
     """Return the effects of model.effects with their values, in the order of the catalogue.
 
-    Parameters
-    ----------
-    config : Config
-        Validated configuration.
-    wheels : Sequence of str, optional
-        Wheels of the arrays (W,), by default all of the configuration.
-
-    Returns
-    -------
-    tuple of Active
-        A parameter is a number or, as `diagnose --model-out` writes it, {value = x, std = y};
-        one not given stays neutral.  A parameter of each wheel may also be a table of these,
-        {FL = x, RR = {value = y, std = z}}, and becomes an array (W,); wheels not given stay neutral.
+    wheels: those of the arrays (W,), by default all.  A parameter is a number or, as `diagnose --model-out` writes it,
+    {value = x, std = y}; one of each wheel may be a table of these, {FL = x, RR = {value = y, std = z}}, and becomes an
+    array.  What is not given stays neutral.
 
     Raises
     ------
@@ -368,29 +331,38 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
         With a line for each unknown effect or parameter, value out of range or not a number,
         effect given twice, or shear law that the effect cannot be combined with.
     """
+    return tuple(
+        Active(effect, {name: value for name, (value, _) in given.items()})
+        for effect, given in _given_effects(config, wheels)
+    )
+
+
+Given = dict[str, tuple[Any, Any]]
+"""Value and sd of each parameter, numbers or (W,)."""
+
+
+def _given_effects(config: Config, wheels: Sequence[str] | None = None) -> list[tuple[Effect, Given]]:
+    """Effects of model.effects with what is given of each parameter, as `effects_of`."""
     if not config.model.effects:
-        return ()
+        return []
     from soilbus.terra.effects.catalogue import CATALOGUE  # not needed at a start without effects
 
     all_wheels = [wheel.name for wheel in config.wheel]
+    columns = [all_wheels.index(name) for name in (all_wheels if wheels is None else wheels)]
     faults: list[str] = []
-    active_effects: dict[str, Active] = {}
+    found: dict[str, Given] = {}
     for setting in config.model.effects:
         try:
-            if setting.name in active_effects:
+            if setting.name in found:
                 raise ConfigError([f"two effects are named {setting.name}"])
-            active_effects[setting.name] = _active(setting, config.model.shear_law, all_wheels)
+            found[setting.name] = _given(setting, config.model.shear_law, all_wheels, columns)
             if CATALOGUE[setting.name].of_tyre and not _has_tyres(config):
                 raise ConfigError([f"{setting.name} is of a tyre, and every wheel is said to be rigid"])
         except ConfigError as error:
             faults += error.faults
     if faults:
         raise ConfigError(f"model.effects: {fault}" for fault in faults)
-    columns = [all_wheels.index(name) for name in (all_wheels if wheels is None else wheels)]
-    return tuple(
-        Active(effect, {name: value[columns] if np.ndim(value) else value for name, value in values.items()})
-        for effect, values in (active_effects[name] for name in CATALOGUE if name in active_effects)
-    )
+    return [(effect, found[name]) for name, effect in CATALOGUE.items() if name in found]
 
 
 def possible_effects(config: Config) -> list[Effect]:
@@ -424,60 +396,31 @@ def delays_of(config: Config) -> dict[str, float]:
 
 
 def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
-    """Return the effects of the estimator's model and their parameters.
+    """Return the effects of the estimator's model, and their parameters with value and sd of each prior.
 
-    Parameters
-    ----------
-    config : Config
-        Validated configuration.
-    undelayed : bool
-        Whether the intake has already corrected the delays of channels (`delays_of`), so that effects which
-        make channels late are left out.
-
-    Returns
-    -------
-    effects : tuple of Effect
-        Those of model.effects, without effects that describe one record only.
-    parameters : tuple of Free
-        Value and sd of each prior; sd 0 holds a parameter.  Parameters that describe one record
-        only are held neutral.  Wheels are those of `rig_of`.
-
-    Raises
-    ------
-    ConfigError
-        As `effects_of`.
+    undelayed: whether the intake has already corrected the delays of channels (`delays_of`), so that effects which make
+    channels late are left out.  Effects that describe one record only are left out, such parameters are held neutral.
+    Wheels are those of `rig_of`; ConfigError as `effects_of`.
     """
-    wheels = rig_of(config).wheels
-    settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
-    active = [a for a in effects_of(config, wheels) if not (a.effect.of_record or (undelayed and a.effect.late))]
-    free: list[Free] = []
-    for effect, values in active:
+    wheels, effects, free = rig_of(config).wheels, list[Effect](), list[Free]()
+    for effect, given in _given_effects(config, wheels):
+        if effect.of_record or (undelayed and effect.late):
+            continue
+        effects.append(effect)
         for parameter in effect.parameters:
-            given, value = settings[effect.name].get(parameter.name), values[parameter.name]
-            if not effect.each_wheel:
-                free.append(Free(effect.name, parameter, None, *_prior_value_std(parameter, value, given)))
-                continue
-            for i, name in enumerate(wheels):
-                of_wheel = given.get(name) if isinstance(given, Mapping) and _by_wheel(given) else given
-                free.append(Free(effect.name, parameter, i, *_prior_value_std(parameter, value[i], of_wheel)))
-    return tuple(effect for effect, _ in active), tuple(free)
+            given_or_neutral = (parameter.neutral, 0.0) if parameter.of_record else given[parameter.name]
+            shape = len(wheels) if effect.each_wheel else 1
+            value, std = (np.broadcast_to(part, shape).tolist() for part in given_or_neutral)
+            for i in range(shape):
+                free.append(Free(effect.name, parameter, i if effect.each_wheel else None, value[i], std[i]))
+    return tuple(effects), tuple(free)
 
 
 def with_effects(config: Config, texts: Iterable[str]) -> Config:
-    """Return the configuration with effects added or changed.
+    """Return the configuration with effects added or changed; ConfigError as `effects_of`.
 
-    Parameters
-    ----------
-    config : Config
-        Validated configuration; not changed.
-    texts : Iterable of str
-        NAME=VALUE for the first parameter of an effect, NAME.PARAMETER=VALUE for another one,
-        NAME.PARAMETER.WHEEL=VALUE for that of one wheel.
-
-    Raises
-    ------
-    ConfigError
-        For a text of another form, an unknown effect, and as `effects_of`.
+    texts: NAME=VALUE for the first parameter of an effect, NAME.PARAMETER=VALUE for another one,
+    NAME.PARAMETER.WHEEL=VALUE for that of one wheel.
     """
     effects_of(config)
     settings: dict[str, dict[str, Any]] = {e.name: dict(e.model_extra or {}) for e in config.model.effects}
@@ -507,7 +450,8 @@ def _set_effect(settings: dict[str, dict[str, Any]], text: str, wheels: Sequence
     setting[parameter] = {**(previous if _by_wheel(previous) else dict.fromkeys(wheels, previous)), wheel[0]: number}
 
 
-def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Active:
+def _given(setting: EffectSetting, shear_law: str, wheels: Sequence[str], columns: Sequence[int]) -> Given:
+    """What is given of an effect's parameters, arrays of the wheels in these columns."""
     effect, given = _effect(setting.name), setting.model_extra or {}
     names = [parameter.name for parameter in effect.parameters]
     faults = [
@@ -517,18 +461,18 @@ def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Ac
     ]
     if effect.base_law not in (None, shear_law):
         faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only: set model.shear_law")
-    values: dict[str, Any] = {}
+    found: Given = {}
     for parameter in effect.parameters:
         try:
             value = given.get(parameter.name, parameter.neutral)
-            values[parameter.name] = (
-                _of_wheels(value, parameter, wheels) if effect.each_wheel else _within(value, parameter)
+            found[parameter.name] = (
+                _of_wheels(value, parameter, wheels, columns) if effect.each_wheel else _value_std(value, parameter)
             )
         except ConfigError as error:
             faults += [f"{effect.name}.{parameter.name}: {fault}" for fault in error.faults]
     if faults:
         raise ConfigError(faults)
-    return Active(effect, values)
+    return found
 
 
 def _effect(name: str) -> Effect:
@@ -539,40 +483,30 @@ def _effect(name: str) -> Effect:
     return CATALOGUE[name]
 
 
-def _of_wheels(given: Any, parameter: Parameter, wheels: Sequence[str]) -> Any:
-    if not _by_wheel(given):
-        return np.full(len(wheels), _within(given, parameter))
-    if unknown := [name for name in given if name not in wheels]:
+def _of_wheels(given: Any, parameter: Parameter, wheels: Sequence[str], columns: Sequence[int]) -> tuple[Any, Any]:
+    by_wheel = given if _by_wheel(given) else dict.fromkeys(wheels, given)
+    if unknown := [name for name in by_wheel if name not in wheels]:
         raise ConfigError([f"no wheel is named {name}{did_you_mean(name, wheels)}" for name in unknown])
-    return np.array([_within(given.get(name, parameter.neutral), parameter) for name in wheels])
+    pairs = [_value_std(by_wheel.get(name, parameter.neutral), parameter) for name in wheels]
+    value, std = np.array(pairs).reshape(-1, 2).T[:, columns]
+    return value, std
 
 
 def _by_wheel(given: Any) -> bool:
     return isinstance(given, Mapping) and "value" not in given
 
 
-def _within(given: Any, parameter: Parameter) -> float:
+def _value_std(given: Any, parameter: Parameter) -> tuple[float, float]:
+    """Value within the parameter's range, and the sd given with it, else 0."""
+    std = 0.0
     if isinstance(given, Mapping) and set(given) <= {"value", "std"}:
-        _std(given)
-        given = given.get("value")
+        std, given = _number(given.get("std", 0.0)), given.get("value")
+        if std < 0.0:
+            raise ConfigError([f"std {std:g} is less than 0"])
     value = _number(given)
     if not parameter.low <= value <= parameter.high:
         raise ConfigError([f"{value:g} is not within {parameter.low:g}..{parameter.high:g}"])
-    return value
-
-
-def _prior_value_std(parameter: Parameter, value: Any, given: Any) -> tuple[float, float]:
-    """Value and sd of a parameter's prior; neutral and held where it describes one record only."""
-    std = _std(given)
-    return (parameter.neutral, 0.0) if parameter.of_record else (float(value), std)
-
-
-def _std(given: Any) -> float:
-    """The sd given with a parameter; 0 without."""
-    std = _number(given.get("std", 0.0)) if isinstance(given, Mapping) else 0.0
-    if std < 0.0:
-        raise ConfigError([f"std {std:g} is less than 0"])
-    return std
+    return value, std
 
 
 def _number(given: Any) -> float:

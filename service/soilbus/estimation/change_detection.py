@@ -3,9 +3,8 @@
     Q(k) = min over d of  sum_{i >= k} |r_i + J_i d|^2_{S_i^-1} + d' H d          H information of the predicted soil
     GLR(k) = n_k / 2 (q - 1 - log q),    q = max(Q(k) / n_k, 1)                     n_k residuals from instant k on
 
-A generalised log likelihood ratio over the instant k of change (GLR; Basseville & Nikiforov, Detection of Abrupt
-Changes, 1993, ch. 2): residuals larger than noise against noise alone, after the part that the predicted
-soil explains within its covariance (step d) is removed.  The likeliest k is where a new soil may begin.
+A generalised log likelihood ratio over the instant k of change (Basseville & Nikiforov, Detection of Abrupt Changes,
+1993, ch. 2), after the part that the predicted soil explains within its covariance (step d) is removed.
 
 The threshold h follows from a false-alarm probability: where the m last instants, of r residuals each, are noise,
 
@@ -24,7 +23,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.linearisation import RESIDUAL, Linearisation
 from soilbus.estimation.solver import Iterate, Objective
-from soilbus.estimation.window import Window
+from soilbus.estimation.window import WHEEL_QUANTITIES, Window
 
 
 class ChangeStatistic(NamedTuple):
@@ -54,8 +53,7 @@ def change_statistic(
     """Return the likeliest beginning of another soil among the instants from index `first` on.
 
     joint_prior predicts soil and gains by earlier data; `at` holds the residuals at its mean, `iterate`. false_alarms
-    is the probability that the noise of one window passes the threshold.  Where the ratio does not pass it, it is an
-    upper bound, to save time.
+    is the probability that the noise of one window passes the threshold; a ratio below it is an upper bound.
     """
     n, m = at.by_latents.shape[:2]
     if first >= n:
@@ -99,8 +97,7 @@ def log_likelihood_ratio(misfit: Array, count: Array) -> Array:
 def alarm_threshold(probability: float, instants: int, residuals: int) -> float:
     """Return the threshold, a log likelihood ratio, that the largest GLR of noise passes with a probability.
 
-    The probability is 0.1 at most, as the formula is of the tail; `residuals` has each of the `instants` at which a
-    change may begin.
+    The probability is 0.1 at most; `residuals` has each of the `instants` at which a change may begin.
 
     Examples
     --------
@@ -143,11 +140,5 @@ def without_transition(window: Window, transition: Transition, ahead: Array) -> 
     """
     arrived = transition.end + (1.0 - ahead) * transition.lag
     between = (window.t[:, None] >= transition.begin) & (window.t[:, None] < arrived)
-
-    def blanked(values: Array) -> Array:
-        return np.where(between, np.nan, values)
-
-    return replace(
-        window, torque=blanked(window.torque), load=blanked(window.load), speed=blanked(window.speed),
-        sinkage=blanked(window.sinkage),
-    )  # fmt: skip
+    blanked: dict[str, Any] = {q: np.where(between, np.nan, getattr(window, q)) for q in WHEEL_QUANTITIES}
+    return replace(window, **blanked)

@@ -1,7 +1,7 @@
 """Joint Gaussian of soil and gains, and the solution of normal equations.
 
-A window determines combinations of soil and gains, so its posterior is kept jointly: without their covariance the same
-ignorance would count as new information each time.  Another marginal of some gains moves the rest by its regression,
+A window determines combinations of soil and gains, so its posterior is kept jointly.  Another marginal of some gains
+moves the rest by its regression,
 
     B = C_xg C_gg^-1,    x += B (g' - g),    C += B (C_gg' - C_gg) B'
 """
@@ -29,8 +29,7 @@ _SOIL = len(PARAMETERS)
 class Gaussian:
     """Mean and covariance of the soil's logarithms and the sensors' gains."""
 
-    # (6,) in SI: the mean in the coordinates in which a window is nearest to Gaussian (see `parametrization`)
-    soil: Array
+    soil: Array  # (6,) in SI: the mean in the coordinates of `parametrization`
     gains: Array  # (G,), relative errors of the sensors and standardised effect parameters
     covariance: Array  # (6 + G, 6 + G), of the soil's logarithms and the gains; rows of held ones are zero
     form: FormPosterior | None = None  # what the model's form leaves open; everything else is of the configured form
@@ -59,8 +58,8 @@ class Gaussian:
     def forgotten(self, kept: float, std: Array) -> Gaussian:
         """Return the Gaussian whose gains have the density p^kept p_0^(1 - kept), p_0 of mean 0 and this sd (G,).
 
-        Stabilised forgetting (Kulhavy & Zarrop 1993, Int. J. Control 58:905): what 1 / (1 - kept) windows say weighs
-        against the prior, so that an error which all windows share does not outweigh it in time.
+        Stabilised forgetting (Kulhavy & Zarrop 1993, Int. J. Control 58:905): an error that all windows share does not
+        outweigh the prior in time.
         """
         at = np.flatnonzero(std > 0.0)
         precision = np.linalg.inv(self.covariance[np.ix_(_SOIL + at, _SOIL + at)])

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.window import TIME_TOLERANCE, VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Rig, Window
 
-__all__ = ["averaged", "instant_of"]
-
 _QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,40 +32,30 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window, pairs, steady, zero_if_unknown
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, wheel_loads
-
-__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "unknown_draft", "with_speeds"]
+from soilbus.terra.vehicle import GRAVITY, axle_loads, wheel_loads
 
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
 
 class Group(NamedTuple):
-    """A channel of one wheel or more: sum(weight x) over these wheels.
-
-    name: of the wheel or the axle that it is mapped for.
-    """
+    """A channel of one wheel or more: sum(weight x) over these wheels."""
 
     wheels: tuple[int, ...]
     weight: tuple[float, ...]
-    name: str
+    name: str  # of the wheel or the axle that it is mapped for
 
 
 class Coupling(NamedTuple):
-    """Two sets of wheels behind a differential; ratio (W,): turns of the shaft before it for one of the wheel.
-
-    bias: sd of the difference of the torques over their sum; locked: the speeds are equal, and the torques differ by
-    anything; is_open: the torques are equal but for friction; of_axle: the vehicle's differential lock acts on it;
-    is_switched: a signal says whether it does.
-    """
+    """Two sets of wheels behind a differential."""
 
     one: tuple[int, ...]
     other: tuple[int, ...]
-    bias: float
-    locked: bool
-    is_open: bool
-    of_axle: bool = True
-    is_switched: bool = False
+    bias: float  # sd of the difference of the torques over their sum
+    locked: bool  # the speeds are equal, and the torques differ by anything
+    is_open: bool  # the torques are equal but for friction
+    of_axle: bool = True  # the vehicle's differential lock acts on it
+    is_switched: bool = False  # a signal says whether it does
 
 
 class Row(NamedTuple):
@@ -78,18 +69,15 @@ class Row(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """Observations of N instants, in the order of the rows: torque, torque_var (N, W); nan where unknown.
+    """Observations of N instants, in the order of the rows; nan where unknown."""
 
-    value, variance (N, 2 W + 1): of loads, speeds and ground speed.  by_inertia, by_draft (N, 2 W + 1) [1]: how the
-    computed loads among them follow m (G sin(pitch) + dv/dt) and the draft as measured, whose noise is not in variance.
-    """
-
-    torque: Array
+    torque: Array  # (N, W)
     torque_var: Array
-    value: Array
+    value: Array  # (N, 2 W + 1) of loads, speeds and ground speed
     variance: Array
+    # (N, 2 W + 1) [1]: how computed loads follow m (G sin(pitch) + dv/dt), whose noise is not in `variance`
     by_inertia: Array
-    by_draft: Array
+    by_draft: Array  # as by_inertia, of the draft as measured
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
         """Return the observations of the given instants."""
@@ -109,22 +97,17 @@ class Instrumentation:
     motors: tuple[Group, ...] = ()  # those that drive several wheels
 
     @property
-    def torque_matrix(self) -> Array:
-        """M of the torques (W, W)."""
-        return np.array([row.weight for row in self.torque])
-
-    @property
     def latent_matrix(self) -> Array:
         """M of loads, speeds and ground speed (2 W + 1, 2 W + 1)."""
         W = len(self.load)
         M = np.eye(2 * W + 1)
-        M[:W, :W], M[W : 2 * W, W : 2 * W] = ([row.weight for row in rows] for rows in (self.load, self.speed))
+        M[:W, :W], M[W : 2 * W, W : 2 * W] = matrix(self.load), matrix(self.speed)
         return M
 
     @property
     def loads_by_torques(self) -> NDArray[np.bool_]:
         """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
-        computed, wheels = self.computes("torque"), np.array([row.weight for row in self.load]) != 0.0
+        computed, wheels = self.computes("torque"), matrix(self.load) != 0.0
         sums = [on for on, row in zip(wheels, self.load, strict=True) if row.kind == "channel"]
         return np.array([
             row.kind == "side" and not computed[on].any() and any(np.array_equal(on, of_sum) for of_sum in sums)
@@ -134,14 +117,13 @@ class Instrumentation:
     @property
     def sides(self) -> tuple[tuple[int, int], ...]:
         """Row of torques and row of loads of each two wheels with equal torques and computed loads."""
-        wheels = {q: [np.array(row.weight) != 0.0 for row in getattr(self, q)] for q in ("torque", "load")}
         return tuple(
             (i, k)
             for i, torque in enumerate(self.torque)
             for k, load in enumerate(self.load)
             if torque.kind == "coupling" and load.kind == "side"
             if self.couplings[torque.at].is_open
-            if np.array_equal(wheels["torque"][i], wheels["load"][k])
+            if [w != 0.0 for w in torque.weight] == [w != 0.0 for w in load.weight]
         )
 
     @property
@@ -156,13 +138,25 @@ class Instrumentation:
         return np.array([any(r.weight[w] for r in rows if r.kind != "channel") for w in range(len(rows))])
 
 
+@lru_cache(64)
+def matrix(rows: tuple[Row, ...]) -> Array:
+    """Return M (W, W) of a quantity's rows."""
+    return np.array([row.weight for row in rows])
+
+
+@lru_cache(64)
+def inverse(rows: tuple[Row, ...]) -> Array:
+    """Return M^-1 (W, W) of a quantity's rows."""
+    return np.asarray(np.linalg.inv(matrix(rows)))
+
+
 def rows_of(
     n_wheels: int, channels: Sequence[Group], gain: float, otherwise: Sequence[Row]
 ) -> tuple[tuple[Row, ...], tuple[str, ...]]:
     """Return W independent rows, channels first, and names (W,) of the raw window's columns.
 
-    A row that the rows before it imply adds nothing and is left out: a motor's speed beside those of its wheels.  The
-    raw window has a channel in the column of the first of its wheels that no channel of fewer wheels has.
+    A row that the rows before it imply is left out.  The raw window has a channel in the column of the first of its
+    wheels that no channel of fewer wheels has.
     """
     rows: list[Row] = []
     for group in channels:
@@ -177,18 +171,11 @@ def rows_of(
     for row in otherwise:
         if len(rows) < n_wheels and _independent(rows, np.array(row.weight)):
             rows.append(row)
-    return tuple(_placed(rows)), tuple(names)
-
-
-def _placed(rows: Sequence[Row]) -> list[Row]:
-    """The rows in an order in which each stands at the place of a wheel that it is of, those of one wheel first."""
-    free = list(range(len(rows)))
-    place: dict[int, Row] = {}
+    place: dict[int, Row] = {}  # each row at the place of a wheel that it is of, those of one wheel first
     for row in sorted(rows, key=lambda row: np.count_nonzero(row.weight)):
-        own = [i for i in free if row.weight[i]] or free
-        place[own[0]] = row
-        free.remove(own[0])
-    return [place[i] for i in range(len(rows))]
+        free = [i for i in range(len(rows)) if i not in place]
+        place[next((i for i in free if row.weight[i]), free[0])] = row
+    return tuple(place[i] for i in range(len(rows))), tuple(names)
 
 
 def _independent(rows: Sequence[Row], weight: Array) -> bool:
@@ -209,18 +196,23 @@ def unit(n_wheels: int, wheel: int) -> tuple[float, ...]:
 
 
 def completed(window: Window, rig: Rig) -> Window:
-    """Return a forward window (`forward`) with a torque, speed and load of every wheel.
+    """Return a forward window with a torque, speed and load of every wheel, and `observations` if there is need.
 
     Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
-    rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
+    rate that of the steering angle where none was.
     """
     window = _of_vehicle(window, rig)
     given = rig.instrumentation
     if given is None or window.observations is not None or not len(window.t):
         return window
-    load, load_of, load_var, by_inertia, by_draft = _loads(window, rig, given)
-    speed, speed_of, speed_var = _speeds(window, rig, given)
-    torque, torque_of, torque_var = _torques(window, given)
+    zero = np.zeros(len(window.t))
+    readings = [window.torque[:, row.at] if row.kind == "channel" else zero for row in given.torque]
+    torque_read = np.stack(readings, axis=1)
+    torque = _combined(torque_read, inverse(given.torque))  # differentials share equally
+    load_of, load_var, load_read, by_inertia, by_draft = _loads(window, rig, given, torque)
+    speed_of, speed_var = _speeds(window, rig, given)
+    torque_var = _torque_variances(window, given, torque)
+    torque_of = np.where(np.isfinite(torque_var), torque_read, np.nan)
     observations = Observations(
         torque_of,
         torque_var,
@@ -228,14 +220,18 @@ def completed(window: Window, rig: Rig) -> Window:
         np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
         *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
     )
+    columns: dict[str, Any] = {
+        "torque": torque,
+        "load": _combined(load_read, inverse(given.load)),
+        "speed": _combined(speed_of, inverse(given.speed)),
+    }
     variance = dict(window.variance)
     for quantity, rows, of_rows in (
         ("load", given.load, load_var), ("speed", given.speed, speed_var), ("torque", given.torque, torque_var),
     ):  # fmt: skip
-        inverse = np.linalg.inv(np.array([row.weight for row in rows]))
         known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
-        variance[quantity] = _combined(known, inverse**2)
-    return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
+        variance[quantity] = _combined(known, inverse(rows) ** 2)
+    return replace(window, variance=variance, observations=observations, **columns)
 
 
 def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
@@ -279,7 +275,7 @@ def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
     given, observations = rig.instrumentation, window.observations
     if given is not None and observations is not None:
         W, value = len(rig.wheels), observations.value.copy()
-        value[:, W : 2 * W] = _combined(speed, np.array([row.weight for row in given.speed]))
+        value[:, W : 2 * W] = _combined(speed, matrix(given.speed))
         observations = observations._replace(value=value)
     return replace(window, speed=speed, observations=observations)
 
@@ -292,7 +288,8 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
         changed["draft"] = np.zeros(len(window.t))
         weight = 0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY
         slope = rig.options.measurements.unknown_slope
-        variance["draft"] = np.where(_shows_slope(window, rig), 0.0, (slope * weight) ** 2)
+        shown = np.isfinite(window.pitch) | (np.isfinite(window.acceleration) & rig.specific_force)
+        variance["draft"] = np.where(shown, 0.0, (slope * weight) ** 2)
     if rig.specific_force and not window.kinematic:
         changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(steady(window).pitch))
     if rig.chassis is not None and np.isfinite(window.steering_angle).any() and not np.isfinite(window.yaw_rate).any():
@@ -305,11 +302,6 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
     return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **columns)
 
 
-def _solved(rows: Sequence[Row], observed: Array) -> Array:
-    """Values of the wheels (N, W) from those of the rows (N, W)."""
-    return _combined(observed, np.linalg.inv(np.array([row.weight for row in rows])))
-
-
 def _combined(values: Array, weight: Array) -> Array:
     """Weighted sums (N, W) of values (N, W); nan where a value with a weight is nan; those without one do not count."""
     unknown = np.isnan(values)
@@ -319,34 +311,34 @@ def _combined(values: Array, weight: Array) -> Array:
     return np.asarray(sums)
 
 
-def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array, Array, Array]:
-    """Loads of the wheels; observations of them, their variances, and what they follow as in `Observations` (N, W)."""
-    n, W, window = len(window.t), len(given.load), steady(window)
+def _loads(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Observations of loads, their variances, what the rows read, and what they follow as in `Observations` (N, W)."""
+    n, W, window, chassis = len(window.t), len(given.load), steady(window), rig.chassis
     load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
-    chassis = rig.chassis
+    if chassis is not None:
+        weight, direction = chassis.mass * GRAVITY, window.directions
+        pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
+        static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
+        upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
     for i, row in enumerate(given.load):
         if row.kind == "channel":
             load[:, i] = scale[:, i] = window.load[:, row.at]
             variance[:, i] = window.variance["load"][:, row.at]
             continue
         assert chassis is not None  # `rig_of` sees to it
-        weight = chassis.mass * GRAVITY
-        pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
-        direction = window.direction if len(window.direction) else np.ones(n)
-        static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
-        upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
         if row.kind == "weight":
             scale[:, i], variance[:, i] = weight * np.cos(pitch), (given.load_noise / 2.0 * weight) ** 2
             load[:, i] = scale[:, i] + _heave(window, rig, given)
         elif row.kind == "transfer":
             along = direction * pitch, direction * zero_if_unknown(window.acceleration)
-            draft, draft_var = _draft_on_hitch(window, rig, given, chassis)
+            draft, draft_var = _draft_on_hitch(window, rig, given, torque)
             front, rear = axle_loads(chassis, direction * draft, *along)
             share = static / weight
             load[:, i] = (1.0 - share) * front - share * rear
             scale[:, i] = static
             by_inertia[:, i] = -direction * chassis.cg_height / chassis.wheelbase
-            by_inertia[~_knows_inertia(window, rig), i] = 0.0
+            knows_slope = np.isfinite(window.pitch) | rig.specific_force
+            by_inertia[~(np.isfinite(window.acceleration) & knows_slope), i] = 0.0
             by_draft[:, i] = -direction * np.isfinite(window.draft) * chassis.hitch_height / chassis.wheelbase
             of_pitch = np.where(by_inertia[:, i] == 0.0, GRAVITY**2 * _known_var(window, "pitch"), 0.0)
             variance[:, i] = (
@@ -368,19 +360,17 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
                 (rig.options.measurements.unknown_slope * axle) ** 2,
             )
             variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
-    return _solved(given.load, load), scale, variance, by_inertia, by_draft
+    return scale, variance, load, by_inertia, by_draft
 
 
 def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
-    """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N].
-
-    An axle bounces on its own tyres: with a dynamic index near one, as tractors have it, the other one does not lose
-    what it gains (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, which shifts load between axles.
-    """
+    """What measured loads hold beyond weight, pitch, acceleration and draft, less its mean in the window (N,) [N]."""
+    # An axle bounces on its own tyres: with a dynamic index near one the other one does not lose what it gains
+    # (Wong 2008, ch. 7, pitch and bounce).  Zero where no draft is known, which shifts load between axles.
     channels = [row for row in given.load if row.kind == "channel"]
     if rig.chassis is None or not channels:
         return np.zeros(len(window.t))
-    direction = window.direction if len(window.direction) else np.ones(len(window.t))
+    direction = window.directions
     along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
     of_wheels = wheel_loads(rig.chassis, rig.ahead, direction * window.draft, *along)
     beyond = np.sum([window.load[:, row.at] - np.array(row.weight) @ of_wheels for row in channels], axis=0)
@@ -388,28 +378,17 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))
 
 
-def _shows_slope(window: Window, rig: Rig) -> NDArray[np.bool_]:
-    """At which instants (N,) a sensor feels the slope."""
-    return np.isfinite(window.pitch) | (np.isfinite(window.acceleration) & rig.specific_force)
-
-
-def _knows_inertia(window: Window, rig: Rig) -> NDArray[np.bool_]:
-    """At which instants (N,) acceleration, and pitch where it counts beside it, are measured."""
-    known = np.isfinite(window.acceleration)
-    return known if rig.specific_force else known & np.isfinite(window.pitch)
-
-
 def unknown_draft(most: Any) -> tuple[Any, Any]:
     """Return mean and sd [N] of a draft that is anywhere from 0 to its bound."""
     return most / 2.0, most / math.sqrt(12.0)
 
 
-def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, chassis: Chassis) -> tuple[Array, Array]:
+def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> tuple[Array, Array]:
     """Draft [N] for the loads, and its variance: where none is measured, at most what the wheels' torques leave it."""
-    known, most = np.isfinite(window.draft), rig.options.measurements.largest_draft * chassis.mass * GRAVITY
-    thrust = (_shares(window, given) / rig.radius).sum(axis=1)
+    mass = 0.0 if rig.chassis is None else rig.chassis.mass
+    known, most = np.isfinite(window.draft), rig.options.measurements.largest_draft * mass * GRAVITY
     along = zero_if_unknown(window.acceleration) + GRAVITY * np.sin(zero_if_unknown(window.pitch))
-    left = np.clip(thrust - chassis.mass * along, 0.0, most)
+    left = np.clip((torque / rig.radius).sum(axis=1) - mass * along, 0.0, most)
     is_measured = np.isfinite(left) & all(row.kind != "unknown" for row in given.torque)
     mean, std = unknown_draft(np.where(is_measured, left, most))
     return np.where(known, window.draft, mean), np.where(known, _known_var(window, "draft"), std**2)
@@ -420,8 +399,8 @@ def _known_var(window: Window, quantity: str) -> Array:
     return np.where(np.isfinite(getattr(window, quantity)) & np.isfinite(variance), variance, 0.0)
 
 
-def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array]:
-    """Speeds of the wheels, observations of them and their variances, each (N, W)."""
+def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array]:
+    """Observations of the wheels' speeds and their variances, each (N, W)."""
     n, W = len(window.t), len(given.speed)
     speed, variance = np.zeros((n, W)), np.zeros((n, W))
     options = rig.options.measurements
@@ -436,12 +415,11 @@ def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Ar
         elif row.kind != "same":  # what turns together has no difference
             speed[:, i] = rolling[:, row.at]
             variance[:, i] = (options.slip_sd * rolling[:, row.at]) ** 2
-    return _solved(given.speed, speed), speed.copy(), variance
+    return speed, variance
 
 
-def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Array]:
-    """Torques of the wheels, observations of them and their variances, each (N, W); nan where a row says nothing."""
-    torque, shares = _torque_readings(window, given), _shares(window, given)
+def _torque_variances(window: Window, given: Instrumentation, torque: Array) -> Array:
+    """Variances of the rows of torques (N, W), by torques of the wheels (N, W); nan where a row says nothing."""
     variance = np.zeros_like(torque)
     for i, row in enumerate(given.torque):
         if row.kind == "channel":
@@ -450,36 +428,24 @@ def _torques(window: Window, given: Instrumentation) -> tuple[Array, Array, Arra
             variance[:, i] = np.nan
         else:
             weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
-            size = np.abs(zero_if_unknown(shares)) @ weight
-            variance[:, i] = np.where(_may_be_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
-    return shares, np.where(np.isfinite(variance), torque, np.nan), variance
-
-
-def _torque_readings(window: Window, given: Instrumentation) -> Array:
-    """What the rows of torques (N, W) read; 0 where no channel does."""
-    zero = np.zeros(len(window.t))
-    return np.stack([window.torque[:, r.at] if r.kind == "channel" else zero for r in given.torque], axis=1)
-
-
-def _shares(window: Window, given: Instrumentation) -> Array:
-    """Torques of the wheels (N, W) where differentials share them equally."""
-    return _solved(given.torque, _torque_readings(window, given))
+            size = np.abs(zero_if_unknown(torque)) @ weight
+            may_be_locked = _locked(window, coupling) | (coupling.is_switched & np.isnan(window.differential_lock))
+            variance[:, i] = np.where(may_be_locked, np.nan, (coupling.bias * size) ** 2)
+    return variance
 
 
 def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
     """At which instants (N,) a differential is locked."""
-    switched = np.zeros(len(window.t), bool)
-    if coupling.of_axle and len(window.differential_lock):
-        switched = zero_if_unknown(window.differential_lock) > 0.5
-    return np.asarray(switched | coupling.locked)
+    return np.asarray((coupling.of_axle & (zero_if_unknown(window.differential_lock) > 0.5)) | coupling.locked)
 
 
-def _may_be_locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
-    """At which instants (N,) a differential is locked, or its lock is silent."""
-    locked = _locked(window, coupling)
-    if coupling.is_switched and len(window.differential_lock):
-        locked |= ~np.isfinite(window.differential_lock)
-    return locked
+def rows_in(rig: Rig, quantity: str) -> tuple[Row, ...]:
+    """Return the rows of torques, loads or speeds; without an instrumentation a channel of each wheel."""
+    if rig.instrumentation is not None:
+        found: tuple[Row, ...] = getattr(rig.instrumentation, quantity)
+        return found
+    W, gain = len(rig.wheels), rig.noise[quantity].gain
+    return tuple(Row(unit(W, i), "channel", i, name, gain) for i, name in enumerate(rig.wheels))
 
 
 def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:

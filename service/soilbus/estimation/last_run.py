@@ -10,20 +10,13 @@ from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.options import ESTIMATOR
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-
-__all__ = ["passes_prior_conflict_test", "prior_from_last_run"]
 
 _SOIL = len(PARAMETERS)
 
 
 def prior_from_last_run(
-    gaussian: Gaussian,
-    soil: SoilPrior,
-    gain_std: Array,
-    elapsed: float,
-    correlation_time: float = ESTIMATOR.tracker.gain_correlation_time,
+    gaussian: Gaussian, soil: SoilPrior, gain_std: Array, elapsed: float, correlation_time: float
 ) -> Gaussian:
     """Return the joint prior of a run: the soil's, and the gains `gaussian` of the last run, `elapsed` seconds ago.
 

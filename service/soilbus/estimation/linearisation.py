@@ -24,12 +24,7 @@ FIRST_GAIN = SOIL.stop
 
 
 class Layout(NamedTuple):
-    """Named slices of the residuals of W wheels.
-
-    rows of an instant (m): torques, balance, sinkages; latents (2 W + 1): loads, speeds, ground_speed.
-    columns: RESIDUAL | SOIL | sensor_columns | effect_columns; within `gains` (G,): sensors (torque_gains,
-    latent_gains in the order of the latents, draft_gain, standing as in `standing.STANDING`), then effects.
-    """
+    """Named slices of rows (m), latents (2 W + 1), gains (G,) and columns of W wheels, in this order."""
 
     torques: slice
     balance: int
@@ -38,7 +33,6 @@ class Layout(NamedTuple):
     loads: slice
     speeds: slice
     ground_speed: int
-    sensors: slice
     torque_gains: slice
     latent_gains: slice
     draft_gain: int
@@ -54,7 +48,7 @@ class Layout(NamedTuple):
         return cls(
             torques=wheels, balance=W, sinkages=slice(W + 1, None),
             n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
-            sensors=slice(n_sensors), torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
+            torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
             draft_gain=3 * W + 1, standing=slice(3 * W + 2, n_sensors), effects=slice(n_sensors, None),
             sensor_columns=slice(FIRST_GAIN, column),
             effect_columns=slice(column, None),
@@ -76,10 +70,6 @@ class Latents(NamedTuple):
     ground_speed: Array
     entry_angle: Array
 
-    def followed_by(self, shared: int, new: Latents) -> Latents:
-        """The last `shared` instants of these, followed by `new`."""
-        return Latents(*[np.concatenate([own[-shared:], other]) for own, other in zip(self, new, strict=True)])
-
     def joined(self) -> Array:
         """Loads, speeds and ground speed (N, 2 W + 1)."""
         return np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
@@ -91,18 +81,11 @@ class Latents(NamedTuple):
 
 @dataclass(slots=True)
 class Linearisation:
-    """Residuals and their derivatives at one point, and the derivatives that update the latents.
+    """Residuals and their derivatives at one point, and the derivatives that update the latents."""
 
-    `rows` (R, 1 + 6 + G), R = N m, has the columns of `Layout`: residual, derivatives by the
-    soil parameters (SI), by the sensor gains (left out with by_sensors=False) and by the
-    effect parameters.  `weighed` is the inverse covariance of each instant times `rows`;
-    `normal` = rows' weighed (1 + 6 + G, 1 + 6 + G) holds chi-square, half its gradient and
-    the information.  Rows without a measurement are zero.
-    """
-
-    rows: Array
-    weighed: Array
-    normal: Array
+    rows: Array  # (R, 1 + 6 + G), R = N m, with the columns of `Layout`; zero without a measurement
+    weighed: Array  # the inverse covariance of each instant times `rows`
+    normal: Array  # rows' weighed: chi-square, half its gradient, the information
     by_latents: Array  # (N, m, 2 W + 1) by the observations of the latents
     inverse: Array  # (N, m, m) inverse covariance of the rows of each instant
     corrected: Array  # (N, 2 W + 1) observations of the latents over 1 + gain
@@ -136,14 +119,12 @@ class Optimum:
 
 
 class Response(NamedTuple):
-    """Drawbar pull [N], torque [N m] and sinkage [m], value (3, N, W), of wheels that carry the latent loads.
+    """Drawbar pull [N], torque [N m], sinkage [m] of wheels that carry the latent loads, and derivatives at held load.
 
-    The next are its derivatives by latents, soil and effect parameters, with the load held.  Those of the load are at
-    the latent entry angle; load_residual [N] is the latent load less the model's. extra_pull [N] is the pull that
-    effects ask of the wheels beyond the measured demand.
+    Derivatives of the load are at the latent entry angle; load_residual [N] is the latent load less the model's.
     """
 
-    value: Array
+    value: Array  # (3, N, W)
     by_load: Array  # (3, N, W), as the next two
     by_speed: Array
     by_ground: Array
@@ -154,7 +135,7 @@ class Response(NamedTuple):
     load_slope: Array  # (N, W), by the entry angle
     load_residual: Array
     by_effects: Array  # (3, P, N, W)
-    extra_pull: Array  # (N,)
+    extra_pull: Array  # (N,) [N] that effects ask of the wheels beyond the measured demand
     extra_pull_by_effects: Array  # (P, N)
 
     def rolling(self, free: NDArray[np.bool_]) -> Response:
@@ -174,16 +155,11 @@ class Response(NamedTuple):
 
 
 class DelayTerms(NamedTuple):
-    """Corrections of the measurements for delays, and their derivatives by the P effect parameters.
+    """Measurements without delay less those taken, and their derivatives by the P effect parameters."""
 
-    torque (N, W) [N m], measured (N, 2 W + 1) of the latents and demand (N,) [N] are the
-    measurements without delay less those taken; by_torque (P, N, W), by_measured and
-    by_demand are their derivatives.
-    """
-
-    torque: Array
-    measured: Array
-    demand: Array
-    by_torque: Array
+    torque: Array  # (N, W) [N m]
+    measured: Array  # (N, 2 W + 1), of the latents
+    demand: Array  # (N,) [N]
+    by_torque: Array  # (P, N, W)
     by_measured: Array
     by_demand: Array

@@ -26,20 +26,16 @@ PHASE_PARTS = 16
 
 
 class Curve(NamedTuple):
-    """Values, slopes [1/s] and second derivatives [1/s^2] at ascending times t [s] (K,), cubics between them.
-
-    slope_gain [1/s^2]: variance of a slope over that of a sample.  step [s] is the median one; half_width the number of
-    samples on each side of a fitted cubic (0: not smoothed); parts the number of places of which it is the mean.
-    """
+    """Values, slopes [1/s] and second derivatives [1/s^2] at ascending times t [s] (K,), cubics between them."""
 
     t: Array
     value: Array
     slope: Array
     second: Array
-    slope_gain: Array
-    step: float
-    half_width: int
-    parts: int = 1
+    slope_gain: Array  # [1/s^2], variance of a slope over that of a sample
+    step: float  # [s], the median one
+    half_width: int  # number of samples on each side of a fitted cubic; 0: not smoothed
+    parts: int = 1  # number of places of which it is the mean
 
     def averaged(self, length: float, parts: int) -> Curve:
         """Return the curve of means over a length [s] about each time, by a number of places evenly spread over it."""
@@ -50,11 +46,9 @@ class Curve(NamedTuple):
         return self._replace(value=value, slope=slope, second=second, parts=parts)
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
-        """Value, slope and second derivative at times t (N,) [s].
+        """Return value, slope and second derivative at times t (N,) [s], each interpolated on its own.
 
         Beyond the ends the curve goes on as a straight line; without samples the value is nan.
-        Each is interpolated on its own: the second derivative of cubics through smoothed values
-        would be mostly remaining noise.
 
         Examples
         --------
@@ -88,7 +82,7 @@ def curve_of(t: Array, value: Array, variance: Array) -> Curve:
             break
         for run in long:
             off[run] = value[run] - _smoothed(value[run], half, 1)[0]
-        risk = float((off**2 * weight).mean()) + 2.0 * _cubics(half).own
+        risk = float((off**2 * weight).mean()) + 2.0 * float(_cubics(half)[0, half, half])
         if risk < least:
             best, least = half, risk
     return _curve(t, value, best)
@@ -124,7 +118,7 @@ def _curve(t: Array, value: Array, half: int) -> Curve:
     runs = _long_enough(runs, half, len(t))
     if not runs:
         return Curve(t, value, slope, second, slope_gain, step, 0)
-    gain = (_cubics(half).weights[1] ** 2).sum(axis=1) / step**2
+    gain = (_cubics(half)[1] ** 2).sum(axis=1) / step**2
     for run in runs:
         smooth[run], by_step, twice = _smoothed(value[run], half)
         slope[run], second[run] = by_step / step, twice / step**2
@@ -183,12 +177,9 @@ def kept_noise(half: int, instants: Instants, ahead: float) -> float:
 
 
 def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tuple[Array, Array]:
-    """Return weights of samples in what n of them have beside their curve, and in its value.
-
-    The value is `ahead` steps after the middle of the n samples, of which the first has index `reach`, or the mean over
-    a number of parts, evenly spread over n steps about there.
-    """
-    weights, nothing = _cubics(half).weights[:, half], np.zeros((3, 2 * reach + n))
+    """Weights of samples in what n of them, from index `reach` on, have beside their curve, and in its value."""
+    # the value is `ahead` steps after the middle of the n samples, or the mean over parts spread over n steps there
+    weights, nothing = _cubics(half)[:, half], np.zeros((3, 2 * reach + n))
 
     def weights_of(index: int) -> Array:
         """Weights (3, samples) in the curve's value, slope and second derivative at one sample."""
@@ -207,11 +198,6 @@ def _weights(half: int, n: int, ahead: float, reach: int, parts: int = 1) -> tup
     return own - np.mean([weights_of(i)[0] for i in range(n)], axis=0), value
 
 
-def powers(steps: Array) -> Array:
-    """Powers 1, s, s^2, s^3 (N, 4) of s (N,)."""
-    return np.asarray(steps[:, None] ** np.arange(4.0))
-
-
 def _hermite(u: Array, h: Array, value: Array, slope: Array, i: NDArray[np.intp]) -> Array:
     """Cubic Hermite interpolation from knot i to the next, h away, at shares u of h, all (N,)."""
     left, right, rise = slope[i], slope[i + 1], (value[i + 1] - value[i]) / h
@@ -219,28 +205,22 @@ def _hermite(u: Array, h: Array, value: Array, slope: Array, i: NDArray[np.intp]
     return np.asarray(value[i] + h * u * (left + u * (square + u * cube)))
 
 
-class _Cubics(NamedTuple):
-    """Weights of value and two derivatives at each of M samples (3, M, M), and w0, a sample's own at the middle."""
-
-    weights: Array
-    own: float
-
-
 @cache
-def _cubics(half: int) -> _Cubics:
+def _cubics(half: int) -> Array:
+    """Weights of value and two derivatives at each of M samples (3, M, M)."""
     offsets = np.arange(-half, half + 1.0)
-    basis = powers(offsets)
+    basis = offsets[:, None] ** np.arange(4.0)
     fit = np.linalg.pinv(basis)
     by_step, twice = np.zeros(basis.shape), np.zeros(basis.shape)
     by_step[:, 1:] = basis[:, :3] * np.arange(1.0, 4.0)
     twice[:, 2:] = basis[:, :2] * np.array([2.0, 6.0])
-    return _Cubics(np.stack([basis, by_step, twice]) @ fit, float((basis @ fit)[half, half]))
+    return np.asarray(np.stack([basis, by_step, twice]) @ fit)
 
 
 def _smoothed(values: Array, half: int, n: int = 3) -> Array:
     """Smoothed values and their first two derivatives by the step number, n of them (n, K), K > 2 half."""
     out = np.empty((n, len(values)))
-    for smooth, weights_at in zip(out, _cubics(half).weights, strict=False):
+    for smooth, weights_at in zip(out, _cubics(half), strict=False):
         smooth[half : len(values) - half] = np.convolve(values, weights_at[half][::-1], "valid")
         smooth[:half] = weights_at[:half] @ values[: 2 * half + 1]
         smooth[len(values) - half :] = weights_at[half + 1 :] @ values[-2 * half - 1 :]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import completed, straightened
+from soilbus.estimation.instrumentation import completed, matrix, rows_in, straightened
 from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
 from soilbus.estimation.standing import SLOPES, STANDING, StandingColumns, standing_columns, standing_std
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
@@ -33,7 +33,6 @@ __all__ = [
     "Curves",
     "Measurements",
     "differentiated_speed",
-    "gain_names",
     "gains_of",
     "travelled",
     "wheel_rotation",
@@ -52,31 +51,21 @@ _BY_INSTANT = (
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
     "inertia", "inertia_var", "draft_noise", "has_balance", "pitch", "since", "distance", "wheel_angle",
     "acceleration", "acceleration_var",
-    "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
-    "_side_known", "standing_rows", "standing_latents",
+    "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "known",
+    "_side_known", "standing_rows", "standing_latents", "held_covariance", "_off_curve",
 )  # fmt: skip
-"""Attributes of `Measurements` with a row for each instant."""
-_BY_INSTANT_IF_ANY = ("held_covariance", "_off_curve")
-"""The same of those that may be None."""
-
-
-def gain_names(rig: Rig) -> list[str]:
-    """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft; then of STANDING."""
-    return gains_of(rig)[0]
+"""Attributes of `Measurements` with a row for each instant, where they are not None."""
 
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
-    """Names and prior sd of the sensor gains; those of rows that no sensor measures have the row's name and sd."""
-    names, std, given = [], [], rig.instrumentation
+    """Names and prior sd of the sensor gains, then of STANDING; rows that no sensor measures have their own."""
+    names, std = [], []
     for quantity in GAIN_QUANTITIES:
         if quantity not in WHEEL_QUANTITIES:
             names.append(quantity)
             std.append(rig.noise[quantity].gain)
-        elif given is None:
-            names += [f"{quantity}.{wheel}" for wheel in rig.wheels]
-            std += [rig.noise[quantity].gain] * len(rig.wheels)
         else:
-            rows = getattr(given, quantity)
+            rows = rows_in(rig, quantity)
             names += [f"{quantity}.{row.name or f'{row.kind}{row.at}'}" for row in rows]
             std += [row.gain for row in rows]
     return [*names, *STANDING], [*std, *standing_std(rig)]
@@ -86,8 +75,7 @@ class Measurements:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
     Each has its variance and a mask of what is known; all are zero where it is not.  `standstill` and `turning` count
-    instants left out: up to min_speed [m/s], and with rim speeds of an axle that differ by more than max_turn of their
-    mean; reversing counts as driving forward.
+    instants left out: up to min_speed [m/s], and with rim speeds that differ by more than max_turn of their mean.
     """
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
@@ -111,19 +99,20 @@ class Measurements:
         self.usable = usable = usable[kept]
         self.n_wheels = n_wheels
 
-        def take(quantity: str) -> Masked:
-            value = getattr(window, quantity)[kept]
-            variance = window.variance[quantity][kept]
+        def masked(value: Array, variance: Array) -> Masked:
+            value, variance = value[kept], variance[kept]
             known = np.isfinite(value) & np.isfinite(variance)
             return np.where(known, value, 0.0), np.where(known, variance, 0.0), known
 
-        self.torque, self.torque_var, known = take("torque")
+        def take(quantity: str) -> Masked:
+            return masked(getattr(window, quantity), window.variance[quantity])
+
         self._observe()
         if window.observations is not None and self._torque_matrix is not None:
-            torque, torque_var = window.observations.torque[kept], window.observations.torque_var[kept]
-            known = np.isfinite(torque) & np.isfinite(torque_var)
-            self.torque, self.torque_var = np.where(known, torque, 0.0), np.where(known, torque_var, 0.0)
+            self.torque, self.torque_var, known = masked(window.observations.torque, window.observations.torque_var)
             usable = (~usable).astype(float) @ (np.abs(self._torque_matrix) > 0.0).T == 0.0
+        else:
+            self.torque, self.torque_var, known = take("torque")
         self.has_torque = known & usable
         torques, self._side_columns = [torque for torque, _ in self._sides], [load for _, load in self._sides]
         self._side_known = self.has_torque[:, torques]
@@ -159,19 +148,18 @@ class Measurements:
             self._measured = self._latents_measured
             self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
         else:
-            value, variance = window.observations.value[kept], window.observations.variance[kept]
-            known = np.isfinite(value) & np.isfinite(variance)
+            value, variance, known = masked(window.observations.value, window.observations.variance)
             self._measured = np.where(known, value, 1.0)
-            self._measured_var = np.where(known & ~self._of_free_wheels(), variance, 0.0)
+            self._measured_var = np.where(self._of_free_wheels(), 0.0, variance)
             self._measured_var[:, self._side_columns] *= ~self._side_known
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
         known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
         row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
         n_kinds = 3 if self.with_sinkage else 2
-        known = np.concatenate(known_rows[:n_kinds], axis=1)
-        self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
-        self._known = known
+        self.known = np.concatenate(known_rows[:n_kinds], axis=1)
+        """Which residuals (N, m) have a measurement."""
+        self._row_var = np.where(self.known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None
         self._off_curve: Array | None = None
@@ -185,7 +173,7 @@ class Measurements:
         self.standing_rows = np.zeros((*self._row_var.shape, len(STANDING)))
         self.standing_rows[:, : self.n_wheels] = torque
         self.standing_rows[:, self.n_wheels] = columns.demand[kept]
-        self.standing_rows[~self._known] = 0.0
+        self.standing_rows[~self.known] = 0.0
         self.standing_latents = latents
 
     def with_own_stamps(self) -> Self:
@@ -205,7 +193,7 @@ class Measurements:
         own = np.zeros((*stamped.standing_rows.shape[:2], W))
         of_torque = np.nan_to_num(slopes["torque"])[kept, None]
         own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque
-        own[~self._known] = 0.0
+        own[~self.known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
         nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
         stamped.standing_latents = np.concatenate([stamped.standing_latents, nothing], axis=2)
@@ -218,15 +206,13 @@ class Measurements:
         return stamped
 
     def on_curves(self) -> Self:
-        """The same with latents on smooth curves of what is measured, where two wheels share a torque.
+        """The same with latents on smooth curves of what is measured, where two wheels share a torque and their load.
 
-        Latents at their conditional optimum are uncorrelated with the residuals if these are weighed by their true
-        covariance.  Computed loads leave more open than they vary by, so the assumed one is several times too large:
-        the latents keep their sensors' noise, and the Jacobian taken there correlates with the residuals.  On the
-        channels' smooth curves it does not (regression calibration: Carroll et al. 2006, Measurement Error in Nonlinear
-        Models, ch. 4).
+        The assumed covariance of computed loads is several times too large: latents keep their sensors' noise, and the
+        Jacobian taken there correlates with the residuals.  On smooth curves it does not (regression calibration:
+        Carroll et al. 2006, Measurement Error in Nonlinear Models, ch. 4).
         """
-        if not self.computes_sides:
+        if not self._sides:
             return self
         smooth = copy(self)
         noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
@@ -246,14 +232,12 @@ class Measurements:
         self._from_observed: Array | None = None
         self._mass_gain: int | None = None
         self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
-        self._by_torques = np.zeros_like(self._prior_only)
         self._sides: tuple[tuple[int, int], ...] = ()
         if given is not None:
-            self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
+            self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
-            self._by_torques[: len(given.load)] = given.loads_by_torques
-            self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
-            self._prior_only &= ~self._by_torques
+            computed = np.array([row.kind != "channel" for row in given.load])
+            self._prior_only[: len(given.load)] = computed & ~given.loads_by_torques
             self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
@@ -281,10 +265,9 @@ class Measurements:
         return torque if self._torque_matrix is None else np.asarray(torque @ self._torque_matrix.T)
 
     def _count(self) -> None:
-        """Set the attributes that follow from the number of instants and the masks."""
-        self.n = len(self.t)
-        self._n_known = int(self._known.sum())
-        self._missing = None if self._n_known == self._known.size else ~self._known
+        """Set the numbers of instants, of an instant's residuals and of residuals with a measurement."""
+        self.n, self._n_residuals, self.n_rows = len(self.t), self.known.shape[1], int(self.known.sum())
+        self._missing = None if self.n_rows == self.known.size else ~self.known
         length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
         self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
 
@@ -324,11 +307,6 @@ class Measurements:
         return self.draft + self.inertia
 
     @property
-    def computes_sides(self) -> bool:
-        """Whether two wheels share a torque, and nothing measures how they share their axle's load."""
-        return bool(self._sides)
-
-    @property
     def computes_loads(self) -> bool:
         """Whether a load stays at its prior, which neither a load cell nor torques measure."""
         return bool(self._prior_only.any())
@@ -336,16 +314,14 @@ class Measurements:
     @property
     def row_channels(self) -> list[tuple[str, str]]:
         """Quantity, and wheel or axle, of each residual of an instant."""
-        given = self.rig.instrumentation
-        torques = list(self.rig.wheels) if given is None else [row.name for row in given.torque]
-        names = [("torque", name) for name in torques] + [("draft", "")]
+        names = [("torque", row.name) for row in rows_in(self.rig, "torque")] + [("draft", "")]
         return names + ([("sinkage", wheel) for wheel in self.rig.wheels] if self.with_sinkage else [])
 
     @property
     def row_wheels(self) -> list[list[int]]:
         """Indices of the wheels of each residual of an instant: of the draft all of them."""
-        given, every = self.rig.instrumentation, range(self.n_wheels)
-        torques = [[i] for i in every] if given is None else [np.flatnonzero(r.weight).tolist() for r in given.torque]
+        every = range(self.n_wheels)
+        torques = [np.flatnonzero(row.weight).tolist() for row in rows_in(self.rig, "torque")]
         return [*torques, [*every], *([i] for i in every if self.with_sinkage)]
 
     @property
@@ -353,11 +329,6 @@ class Measurements:
         """What the sensors read in the rows of an instant (N, m): torques [N m], draft [N], sinkages [m]."""
         parts = [self.torque, self.draft[:, None]] + ([self.sinkage] if self.with_sinkage else [])
         return np.concatenate(parts, axis=1)
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Which residuals (N, m) have a measurement."""
-        return self._known
 
     @property
     def wheel_torque(self) -> Array:
@@ -369,27 +340,14 @@ class Measurements:
     @property
     def measured_rows(self) -> NDArray[np.bool_]:
         """Which residuals (m,) of an instant are of a sensor, and not of how a differential shares torque."""
-        given, rest = self.rig.instrumentation, self._n_residuals - self.n_wheels
-        torques = [True] * self.n_wheels if given is None else [row.kind == "channel" for row in given.torque]
-        return np.array([*torques, *[True] * rest])
+        torques = [row.kind == "channel" for row in rows_in(self.rig, "torque")]
+        return np.array([*torques, *[True] * (self._n_residuals - self.n_wheels)])
 
     @property
     def measured_latents(self) -> NDArray[np.bool_]:
         """Which latents (2 W + 1,) a sensor measures, and no geometry or coupling computes."""
-        given, W = self.rig.instrumentation, self.n_wheels
-        if given is None:
-            return np.ones(2 * W + 1, bool)
-        return np.array([*(row.kind == "channel" for row in (*given.load, *given.speed)), True])
-
-    @property
-    def _n_residuals(self) -> int:
-        """Number m of residuals of an instant."""
-        return int(self._row_var.shape[1])
-
-    @property
-    def n_rows(self) -> int:
-        """Number of residuals with a measurement."""
-        return self._n_known
+        rows = *rows_in(self.rig, "load"), *rows_in(self.rig, "speed")
+        return np.array([*(row.kind == "channel" for row in rows), True])
 
     def sample_time(self, quantity: str) -> float:
         """Time [s] between samples of a quantity, the longest of its channels; 0 where only bins are known."""
@@ -428,8 +386,6 @@ class Measurements:
         """The same with the given instants only."""
         part = copy(self)
         for name in _BY_INSTANT:
-            setattr(part, name, getattr(self, name)[instants])
-        for name in _BY_INSTANT_IF_ANY:
             values = getattr(self, name)
             setattr(part, name, None if values is None else values[instants])
         part._count()
@@ -451,26 +407,18 @@ class Curves:
             names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self._wheels]
             if all(name in self.window.curves for name in names):
                 return self._cache.setdefault(quantity, [self.window.curves[name] for name in names])
-            shape = len(self.window.t), self.number_of(quantity)
-            columns = values.reshape(shape), variances.reshape(shape)
-            self._cache[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
+            shape, curves = (len(self.window.t), len(names)), self._cache.setdefault(quantity, [])
+            for value, variance in zip(values.reshape(shape).T, variances.reshape(shape).T, strict=True):
+                known = np.isfinite(value) & np.isfinite(variance)
+                curves.append(curve_of(self.window.t[known], value[known], variance[known]))
         return self._cache[quantity]
-
-    def number_of(self, quantity: str) -> int:
-        """Number of curves that `of` returns, without computing them."""
-        values = getattr(self.window, quantity)
-        return 1 if values.ndim == 1 else int(values.shape[1])
-
-    def _curve(self, values: Array, variance: Array) -> Curve:
-        known = np.isfinite(values) & np.isfinite(variance)
-        return curve_of(self.window.t[known], values[known], variance[known])
 
 
 def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Return loads (N, W) and variances, with the mean in place of a track's loads that vary no more than their noise.
 
-    A track presses evenly, so that nothing but its load tells c and tan phi apart.  Gauss-Newton takes noise in a
-    regressor for information (Neyman & Scott 1948, Econometrica 16:1), and would tell them apart by it.
+    A track presses evenly, so that only its load tells c and tan phi apart; Gauss-Newton takes noise in a regressor for
+    information (Neyman & Scott 1948, Econometrica 16:1).
     """
     load, variance = load.copy(), variance.copy()
     for w in range(load.shape[1]):

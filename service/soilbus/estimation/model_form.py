@@ -8,10 +8,9 @@ strength may be mobilised by another law.  Along form parameters f, 0 in the con
     information     I_f = B' W B - (J' W B)' H^-1 (J' W B), over a discount: of scores by seconds, and of what all share
 
 with H = J' W J + H_0 (considered parameters: Schmidt 1966; Tapley, Schutz & Born, Statistical Orbit Determination,
-2004, ch. 6).  The configured form is itself a published one: it holds with probability 1 - OPEN, else f is as open as
-prior and window leave it (spike and slab: Mitchell & Beauchamp 1988, J. Am. Stat. Assoc. 83:1023).  What is reported is
-the mean and the covariance of both.  One window says little of the form and all have the same errors, so nothing of f
-is carried from window to window.
+2004, ch. 6).  The configured form holds with probability 1 - OPEN, else f is as open as prior and window leave it
+(spike and slab: Mitchell & Beauchamp 1988, J. Am. Stat. Assoc. 83:1023).  All windows have the same errors of form, so
+nothing of f is carried from window to window.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ SIDE = np.array([-1.0, 1.0, 1.0, 1.0])
 OF_SQUARE = np.array([1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0, 1.0 / 4.0])
 """Variance over the square of the range: even between its ends (1/12), or either end as likely (1/4: a shear law)."""
 OPEN = 0.8
-"""Probability that the contact is of another form than the configured one, which is itself a published form.  With 0.5
-intervals of pressure are too narrow for another published wheel."""
+"""Probability of another form than the configured one.  With 0.5 intervals of pressure are too narrow for another
+published wheel."""
 _SOIL = len(PARAMETERS)
 
 
@@ -58,15 +57,11 @@ def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class FormPosterior:
-    """The form parameters after a window, and how soil and gains depend on them.
+    """The form parameters after a window, 0 being the configured form, and how soil and gains depend on them."""
 
-    by_form (6 + G, 4): derivatives of the soil's logarithms and of the gains by FORM; mean (4,) and covariance (4, 4)
-    of the form parameters, 0 being the configured form.
-    """
-
-    by_form: Array
-    mean: Array
-    covariance: Array
+    by_form: Array  # (6 + G, 4), derivatives of the soil's logarithms and of the gains by FORM
+    mean: Array  # (4,) of the form parameters
+    covariance: Array  # (4, 4)
 
     @classmethod
     def of(cls, farthest: Sequence[float], n_gains: int) -> FormPosterior:
@@ -150,10 +145,8 @@ def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> Form
 
 
 def _discount(scores: Array, information: Array, problem: ObservationModel) -> float:
-    """Return how much more the scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least.
-
-    Scores are those of the form with soil and gains eliminated (covariance by blocks: Newey & West 1987).
-    """
+    """How much more scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least."""
+    # soil and gains are eliminated from the scores (covariance by blocks: Newey & West 1987)
     blocks = block_sums(scores, problem.t, problem.options.variance.block)
     variance = np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0]
     return max(float(np.trace(variance)) / len(information), 1.0)

@@ -7,9 +7,8 @@ prior) and the Gaussian there,
     -2 log evidence = -2 log posterior(mode) + log det H - log det H_prior          (Laplace)
 
 `fit_window` finds it where nothing is known: the soil alone descends on a few instants, with loads and speeds as
-measured, from the prior's median, loam and the likeliest soils of the table until two descents meet; from the best end
-soil, gains and latents descend together on all instants.  `fit_warm` starts at the optimum of the window before.
-All return a `Fit`.
+measured, from several soils until two descents meet; from the best end soil, gains and latents descend together on all
+instants.  `fit_warm` starts at the optimum of the window before.
 """
 
 from __future__ import annotations
@@ -30,12 +29,6 @@ from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import Iterate, Objective, Solution, Termination, WindowModel, minimise
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
-
-__all__ = [
-    "Fit",
-    "fit_at",
-    "fit_window",
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +80,14 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
     options, objective = problem.options.search, Objective(problem, prior, joint_prior)
     thin = Objective(problem.thinned(options.thinned), prior, joint_prior, as_measured=True)
     with np.errstate(all="ignore"):
-        ends = _search(thin)
-        return _joint_fit(objective, ends[0]) if ends else None
+        end = _best_end(thin)
+        if end is None:
+            return None
+        start = objective.start(end.previous.soil, gains=end.previous.gains)
+        descent = options.cold
+        if not end.value < options.implausible * options.thinned:
+            descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
+        return fit_at(objective, minimise(objective, start, descent), end.evaluations)
 
 
 class WarmStart(NamedTuple):
@@ -119,9 +118,7 @@ def fit_warm(start: WarmStart) -> Fit | None:
             return None
         near = objective.stepped(start.iterate, model, step)
         return fit_at(
-            objective,
-            minimise(objective, near, objective.options.warm, model.squared_length(step)),
-            evaluations=1,
+            objective, minimise(objective, near, objective.options.warm, model.squared_length(step)), evaluations=1
         )
 
 
@@ -143,11 +140,8 @@ def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
     return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
 
 
-def _search(thin: Objective) -> list[Solution[Iterate, WindowModel]]:
-    """Ends of descents of the soil alone on a few instants, the best first.
-
-    Descents from the starts in turn; two that meet at a plausible objective end the search.
-    """
+def _best_end(thin: Objective) -> Solution[Iterate, WindowModel] | None:
+    """Best end of the soil's descents on a few instants; two that meet at a plausible objective end the search."""
     options, ends = thin.options, list[Solution[Iterate, WindowModel]]()
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
         end = minimise(thin, thin.start(np.asarray(start)), options.soil_alone)
@@ -157,16 +151,7 @@ def _search(thin: Objective) -> list[Solution[Iterate, WindowModel]]:
         ends.append(end)
         if met and end.value < options.plausible_chi2 * thin.problem.n_rows:
             break
-    return sorted(ends, key=lambda end: end.value)
-
-
-def _joint_fit(objective: Objective, end: Solution[Iterate, WindowModel]) -> Fit | None:
-    """The fit to all instants from an end of the search; None where the numbers are not finite."""
-    options, start = objective.options, objective.start(end.previous.soil, gains=end.previous.gains)
-    descent = options.cold
-    if not end.value < options.implausible * options.thinned:
-        descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
-    return fit_at(objective, minimise(objective, start, descent), end.evaluations)
+    return min(ends, key=lambda end: end.value, default=None)
 
 
 def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluations: int = 0) -> Fit | None:

@@ -58,11 +58,7 @@ def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
 
 
 def active_at(effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int) -> list[Active]:
-    """Return the effects, in the catalogue's order, with their values at standardised parameters (P,).
-
-    Values are floats, or (W,) where each wheel has its own.  Effects without any influence at these values are left
-    out, to save time.
-    """
+    """Return the effects that have an influence at standardised parameters (P,), with their values, float or (W,)."""
     values = _values(effects, free, [f.at(u) for f, u in zip(free, standardised.tolist(), strict=True)], n_wheels)
     return [Active(e, values[e.name]) for e in effects if not _absent(e, values[e.name])]
 

@@ -15,12 +15,10 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 
     r <- r + A (x_measured / (1 + g_x) - x),    covariance  S = A V A' + R,    chi-square = sum r' S^-1 r.
 
-A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
-(`with_weights_at`), and its noise by draft and inertia is that of the balance.  Only the difference left to right of
-two wheels on a load cell of the axle, with a torque sensor each, is fitted, as their torques measure it: torque and
-pull are curved in the load, so that unequal loads held equal bias the soil.  Behind an open differential equal torques
-and unequal slips say how they differ: T_left(W_left) = T_right(W_right) fixes the difference, as T = 0 fixes the slip
-of a free wheel, and that row is used up.
+A load that is computed stays at its prior; what it leaves open, A V A', is a weight that models share
+(`with_weights_at`), and its noise by draft and inertia is that of the balance.  The difference left to right of two
+wheels on a load cell of the axle, with a torque sensor each, is fitted: unequal loads held equal bias the soil.  Behind
+an open differential T_left(W_left) = T_right(W_right) fixes it, as T = 0 fixes the slip of a free wheel.
 
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`, columns and
 rows as in `Layout`).  `observation_with_effects` adds effects to the wheel-soil model.
@@ -66,10 +64,9 @@ from soilbus.terra.wheel import (
 class ObservationModel(Measurements):
     """One window's measurements and the wheel-soil model; `linearise` gives residuals and derivatives at any soil.
 
-    min_speed: ground speed [m/s] up to which instants are left out; max_turn: relative difference of an axle's rim
-    speeds above which they are, as in `config.model.Estimator`.  The nuisance parameters, `gains` (G,) throughout, are
-    the sensors' relative gain errors in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) are
-    the lowest and the highest values, infinite where there is none. `work` counts evaluations.
+    min_speed, max_turn: as in `config.model.Estimator`.  The nuisance parameters, `gains` (G,), are the sensors'
+    relative gain errors in the order of `gain_names`, then the effect parameters; `gain_bounds` (2, G) may be infinite.
+    `work` counts evaluations.
     """
 
     def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = 0.15) -> None:
@@ -99,7 +96,7 @@ class ObservationModel(Measurements):
         rolling_slip = self._rolling_slip(at, latents)
         if self.rolls.any():
             at = at.rolling(self.rolls)
-        A = self._by_observed(self._by_latents(at))
+        A = self._by_observed(at)
         torque = self.torque_rows(at.value[1])
 
         of_torque, of_latents, of_draft, of_mass, corrected, variance, row_var = self._corrected(gains)
@@ -130,7 +127,10 @@ class ObservationModel(Measurements):
             by_gain[:, :, layout.standing] = self.standing_rows + A @ self.standing_latents
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
-            residual += self._delay_residuals(delay, A, gains)
+            late = np.zeros_like(residual)
+            late[:, torques], late[:, balance] = delay.torque * of_torque, delay.demand
+            late += (A @ (delay.measured * of_latents)[:, :, None])[:, :, 0]
+            residual += np.where(self.known, late, 0.0)
             by_delay = delay.by_measured * of_latents
             by_effects[:, torques] += (of_torque * delay.by_torque).transpose(1, 2, 0)
             by_effects[:, balance] += delay.by_demand.T
@@ -183,7 +183,9 @@ class ObservationModel(Measurements):
             return inverse_covariance(A, variance, row_var)
         balance, held = self.layout.balance, self.held_covariance
         further = self._by_load_noise(A, variance) if held is None else held.copy()
-        for by, share in zip((self.by_inertia, self.by_draft), self._demand_shares, strict=True):
+        known = self.has_balance & (self.demand_var > 0.0)
+        for by, part in ((self.by_inertia, self.inertia_var), (self.by_draft, self.draft_var)):
+            share = np.divide(part, self.demand_var, out=np.zeros(self.n), where=known)
             of_loads, noise = (A @ by[:, :, None])[:, :, 0], (share * row_var[:, balance])[:, None]
             further += of_loads[:, :, None] * (noise * of_loads)[:, None]
             further[:, balance] += noise * of_loads
@@ -195,21 +197,11 @@ class ObservationModel(Measurements):
         of_loads = A[:, :, self._prior_only]
         return np.asarray((of_loads * variance[:, None, self._prior_only]) @ of_loads.swapaxes(1, 2))
 
-    @property
-    def _demand_shares(self) -> tuple[Array, Array]:
-        """Shares of inertia and draft (N,) in the variance of the demand."""
-        known = self.has_balance & (self.demand_var > 0.0)
-        shares = (
-            np.divide(v, self.demand_var, out=np.zeros(self.n), where=known) for v in (self.inertia_var, self.draft_var)
-        )
-        return next(shares), next(shares)
-
     def with_weights_at(self, at: Linearisation) -> Self:
         """The same measurements with the covariance that computed loads bring held as at a linearisation.
 
-        A computed load has no noise of its own that tells it from what it should be: A V A' of it is a weight.  Where
-        that followed the model, one of larger A would seem to fit better (generalised least squares: Carroll & Ruppert
-        1988, Transformation and Weighting in Regression, sect. 2.1).  The same where all loads are measured.
+        A V A' of a computed load is a weight; where it followed the model, one of larger A would seem to fit better
+        (Carroll & Ruppert 1988, Transformation and Weighting in Regression, sect. 2.1).
         """
         held = copy(self)
         if self.computes_loads:
@@ -217,11 +209,7 @@ class ObservationModel(Measurements):
         return held
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
-        """Observations (N, S) of loads left less right after a Newton step to equal torques.
-
-        A: derivatives of the residuals by the observations; torque: of the wheels (N, W) [N m]; now: observations of
-        the latents, in which equal loads are the axle's load.
-        """
+        """Observations (N, S) of loads left less right after a Newton step from those `now` to equal torques (N, W)."""
         found = now[:, self._side_columns]
         off, most = self.torque_rows(torque), self.options.measurements.max_side_load
         for s, (row, column) in enumerate(self._sides):
@@ -232,11 +220,9 @@ class ObservationModel(Measurements):
         return found
 
     def _by_sides(self, A: Array) -> Array:
-        """Derivatives (N, S, m) of the residuals by those of equal torques, through the side loads; A (N, m, 2 W + 1).
-
-        With r_e the residual of equal torques of two wheels and x their side load, r_e + (dr_e/dx) dx = 0 takes x out
-        of every other row: r <- r - (dr/dx) / (dr_e/dx) r_e, and so of its derivatives (`_without_sides`).
-        """
+        """Derivatives (N, S, m) of the residuals by those of equal torques, through the side loads."""
+        # With r_e the residual of equal torques and x the side load, r_e + (dr_e/dx) dx = 0 takes x out of every row:
+        # r <- r - (dr/dx) / (dr_e/dx) r_e, and so of its derivatives (`_without_sides`).
         by_sides = np.zeros((self.n, len(self._sides), A.shape[1]))
         for s, (row, column) in enumerate(self._sides):
             slope = np.where(self._side_known[:, s] & (A[:, row, column] != 0.0), A[:, row, column], np.inf)
@@ -255,7 +241,13 @@ class ObservationModel(Measurements):
             return np.zeros((self.n, 0))
         ratio = latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        return rolling_step(1.0 - ratio, at.value[1][:, free], by_slip, self.options.measurements.max_rolling_skid)
+        torque, limit = (
+            at.value[1][:, free],
+            0.05,
+        )  # in one step: the torque is curved within K over the contact's length
+        step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
+        most = self.options.measurements.max_rolling_skid
+        return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
@@ -299,27 +291,20 @@ class ObservationModel(Measurements):
         out[4] *= 1.0 + np.tan(soil.phi) ** 2
         return out
 
-    def _by_latents(self, at: Response) -> Array:
-        """Derivatives A (N, m, 2 W + 1) of the residuals by the latents."""
+    def _by_observed(self, at: Response) -> Array:
+        """Derivatives A (N, m, 2 W + 1) of the residuals by the observations of the latents."""
         layout = self.layout
         loads, speeds, ground, balance = layout.loads, layout.speeds, layout.ground_speed, layout.balance
         A = np.zeros((self.n, self._n_residuals, layout.n_latents))
         by_load, by_speed, by_ground = -at.by_load, -at.by_speed, -at.by_ground
-        A[:, balance, loads], A[:, balance, speeds], A[:, balance, ground] = (
-            by_load[0],
-            by_speed[0],
-            by_ground[0].sum(1),
-        )
+        A[:, balance, loads], A[:, balance, speeds] = by_load[0], by_speed[0]
+        A[:, balance, ground] = by_ground[0].sum(1)
         kinds = ((1, layout.torques), (2, layout.sinkages)) if self.with_sinkage else ((1, layout.torques),)
         for kind, rows in kinds:
             wheel_rows = A[:, rows]
             np.einsum("nww->nw", wheel_rows[:, :, loads])[:] = by_load[kind]
             np.einsum("nww->nw", wheel_rows[:, :, speeds])[:] = by_speed[kind]
             wheel_rows[:, :, ground] = by_ground[kind]
-        return A
-
-    def _by_observed(self, A: Array) -> Array:
-        """Derivatives (N, m, 2 W + 1) of rows by observations, from those of the wheels' rows by their latents."""
         if self._torque_matrix is None or self._from_observed is None:
             return A
         A[:, self.layout.torques] = self._torque_matrix @ A[:, self.layout.torques]
@@ -328,14 +313,12 @@ class ObservationModel(Measurements):
     def _corrected(self, gains: Array) -> tuple[Array, Array, float, float, Array, Array, Array]:
         """Factors 1 / (1 + gain) of torques, latents, draft, mass; corrected latents; their variances; those of rows.
 
-        A sensor reads (1 + gain) times the truth, plus noise.  Measurements are divided by
-        1 + gain and their noise too; else a gain that makes everything smaller would seem to
-        fit better.
+        Noise is divided by 1 + gain too; else a gain that makes everything smaller would seem to fit better.
         """
         layout = self.layout
-        gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
-        of_torque, of_latents = gain_factors[layout.torque_gains], gain_factors[layout.latent_gains]
-        of_draft = float(gain_factors[layout.draft_gain])
+        factors = 1.0 / (1.0 + gains[: layout.standing.start])
+        of_torque, of_latents = factors[layout.torque_gains], factors[layout.latent_gains]
+        of_draft = float(factors[layout.draft_gain])
         row_var = self._row_var.copy()
         row_var[:, layout.torques] *= of_torque**2
         of_mass = 1.0 if self._mass_gain is None else float(of_latents[self._mass_gain])
@@ -347,25 +330,13 @@ class ObservationModel(Measurements):
         """Corrections for delays at gains (G,); None without."""
         return None
 
-    def _delay_residuals(self, delay: DelayTerms, A: Array, gains: Array) -> Array:
-        """Part (N, m) of the residuals due to delays; A (N, m, 2 W + 1): their derivatives by the latents."""
-        residual, layout = np.zeros(A.shape[:2]), self.layout
-        gain_factors = 1.0 / (1.0 + gains[: layout.standing.start])
-        residual[:, layout.torques] = delay.torque * gain_factors[layout.torque_gains]
-        residual[:, layout.balance] = delay.demand
-        residual += (A @ (delay.measured * gain_factors[layout.latent_gains])[:, :, None])[:, :, 0]
-        residual[~self._known] = 0.0
-        return residual
-
     def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
         """Latents at their conditional optimum after a step of the soil (6,) in SI and of gains (G,): the linear model.
 
         `at` is the linearisation at `latents`, with derivatives by the sensor gains.
         """
         layout = self.layout
-        weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
-            self.n, 1, at.by_latents.shape[1]
-        )
+        weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(self.n, 1, self._n_residuals)
         noise = self._off_curve
         if noise is None:
             noise = np.where(self._prior_only, 0.0, at.variance) * (weighed @ at.by_latents)[:, 0]
@@ -380,16 +351,13 @@ class ObservationModel(Measurements):
             speed[:, self.rolls] = ground[:, None] / (self.rig.radius[self.rolls] * (1.0 - at.rolling_slip))
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         more = load - latents.load - at.load_by_slip * slip_change
-        return Latents(
-            load, speed, ground, self.stepped_entry_angle(at, latents.entry_angle, soil_step, gain_step, more)
-        )
+        angle = self.stepped_entry_angle(at, latents.entry_angle, soil_step, gain_step, more)
+        return Latents(load, speed, ground, angle)
 
     def _latents(self, joined: Array, entry_angle: Array) -> Latents:
         """Latents from loads, speeds and ground speed (N, 2 W + 1) and entry angles (N, W)."""
-        layout = self.layout
-        return Latents(
-            joined[:, layout.loads], joined[:, layout.speeds], joined[:, layout.ground_speed], entry_angle
-        )  # fmt: skip
+        at = self.layout
+        return Latents(joined[:, at.loads], joined[:, at.speeds], joined[:, at.ground_speed], entry_angle)
 
     def stepped_entry_angle(
         self, at: Linearisation, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0
@@ -398,8 +366,7 @@ class ObservationModel(Measurements):
 
         more_load (N, W) [N] is the change of the latent loads less the part that the change of slip carries.
         """
-        N, W = self.n, self.n_wheels
-        change = more_load + at.load_residual - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
+        change = more_load + at.load_residual - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(angle.shape)
         if len(at.load_by_effects):
             change -= np.tensordot(gain_step[self.layout.effects], at.load_by_effects, 1)
         return near_angle(angle, change / at.load_slope)
@@ -428,13 +395,13 @@ class ObservationModel(Measurements):
             return np.asarray(np.where(self.usable, depth, 0.0).sum(0) / known)
 
     def standardised(self, at: Linearisation) -> tuple[Array, Array]:
-        """Each residual given the others of its instant, over its sd (N, m), and derivatives (N, m, 6 + G) of these.
+        """Each residual given the others of its instant, over its sd (N, m), and derivatives; nan where none.
 
-        Standard normal where model and noise are right; nan without a measurement.
+        Standard normal where model and noise are right.
         """
         root = np.sqrt(np.einsum("nmm->nm", at.inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
-        weighed[~self._known] = np.nan
+        weighed[~self.known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
 
     def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
@@ -453,16 +420,12 @@ class ObservationModel(Measurements):
         if self.with_sinkage:
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
         self._without_sides(rows, at.by_sides)
-        rows[~self._known] = 0.0
+        rows[~self.known] = 0.0
         weighed = at.inverse @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
     def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]) -> Array:
-        """Derivatives (3, 3, S, W) of drawbar pull, torque and sinkage by three form parameters, at some instants.
-
-        The form parameters are the ratio of the angle of greatest stress to the entry angle, the
-        ratio of the exit angle (positive behind the axle) to it, and the share of the other shear law.
-        """
+        """Derivatives (3, 3, S, W) of pull, torque, sinkage by peak and exit angle over entry angle, and shear law."""
         shape, other = (len(instants), self.n_wheels), 1.0
         state, model = self._wheels_in_contact(soil, gains, latents, instants)
         if model.shear_law == "exponential":  # the same law as a share of 1, which can be reduced
@@ -529,7 +492,8 @@ class ObservationModel(Measurements):
         slip_change = (old.ground_speed[:, None] / old.speed)[near] - ground[:, None] / speed
         more = load - old.load[near] + at.load_residual[near] - at.load_by_slip[near] * slip_change / self.rig.radius
         angle = near_angle(old.entry_angle[near], more / at.load_slope[near])
-        return old.followed_by(shared, Latents(load, speed, ground, angle))
+        new = Latents(load, speed, ground, angle)
+        return Latents(*[np.concatenate([own[-shared:], other]) for own, other in zip(old, new, strict=True)])
 
     def _shared(self, t: Array) -> int:
         """Number of first instants that are the last ones of times t (M,) [s]."""
@@ -538,28 +502,15 @@ class ObservationModel(Measurements):
 
 
 def near_angle(angle: Array, step: Array) -> Array:
-    """Entry angles [rad] after a step of the linear model, which changes them by a factor within 0.6 and 1.6."""
+    """Return entry angles [rad] after a step of the linear model, a factor within 0.6 and 1.6."""
     return np.asarray(np.clip(angle + step, angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)))
-
-
-def rolling_step(slip: Array, torque: Array, by_slip: Array, most: float) -> Array:
-    """Slips (N, F) of free wheels after one Newton step towards zero torque [N m]; most: greatest skid [1]."""
-    limit = 0.05  # in one step: the torque is curved within K over the contact's length of zero
-    step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
-    return np.asarray(np.clip(slip + np.clip(step, -limit, limit), -most, 0.0))
-
-
-SINGULAR_RIDGE = 1e-10
-"""Added to the squares of rows in their sd where these are linearly dependent within rounding (eps m = 1e-15)."""
 
 
 def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array | None = None) -> Array:
     """Inverse covariance (A V A' + R + further)^-1 (N, m, m) of the residuals of every instant.
 
     A: derivatives of the residuals by the observations (N, m, 2 W + 1); variance (N, 2 W + 1) and row_var (N, m):
-    diagonals of V and R.  Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point
-    far from any soil one latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a
-    point of finite cost.
+    diagonals of V and R.  Rows in N m, N and m are scaled by their sd before the inversion.
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
     diagonal = np.einsum("nmm->nm", S)  # a view
@@ -570,8 +521,8 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array
     S *= scale[:, :, None] * scale[:, None, :]
     try:
         inverse = np.linalg.inv(S)
-    except np.linalg.LinAlgError:
-        diagonal += SINGULAR_RIDGE
+    except np.linalg.LinAlgError:  # one latent swamps all rows, which differ by rounding only (eps m = 1e-15)
+        diagonal += 1e-10
         inverse = np.linalg.inv(S)
     return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
 

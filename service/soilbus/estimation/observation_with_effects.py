@@ -14,14 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.linearisation import (
-    DelayTerms,
-    Latents,
-    Response,
-)
+from soilbus.estimation.linearisation import DelayTerms, Latents, Response
 from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_derivatives
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
 from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.tangent import forces_along
@@ -44,9 +40,8 @@ _SOIL_NAMES = Soil._fields
 class ObservationModelWithEffects(ObservationModel):
     """An observation model whose wheel-soil model has effects; `free` are the effects' P parameters.
 
-    In `gains` they follow the sensor gains, standardised: (value - prior value) / prior sd,
-    so zero with variance one before any data.  Soil, latents and parameters go through the
-    effects' hooks with their derivatives (see terra.dual) in one integration.
+    Soil, latents and parameters go through the effects' hooks with their derivatives (see terra.dual) in one
+    integration.
     """
 
     def __init__(
@@ -78,11 +73,8 @@ class ObservationModelWithEffects(ObservationModel):
         self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
 
     def _sensor_std(self) -> Array:
-        """Return the prior sd of the sensors' gains; a channel that an effect delays has no lateness beside it.
-
-        Two shifts of opposite sign would leave a second difference, which takes up noise.  Torques keep theirs, by
-        which they differ from each other.
-        """
+        """Prior sd of the sensors' gains; a channel that an effect delays, but a torque, has no lateness beside it."""
+        # two shifts of opposite sign would leave a second difference, which takes up noise
         fitted = {(f.effect, f.parameter.name) for f in self.free if f.std > 0.0}
         late = [q for e in self.effects for q, names in e.late.items() if (e.name, names.delay) in fitted]
         names, std = [name.split(".") for name in self.gain_names[: self.n_sensors]], self.sensor_std.copy()
@@ -99,13 +91,17 @@ class ObservationModelWithEffects(ObservationModel):
         standardised = gains[self.layout.effects]
         active = active_with_derivatives(self.effects, self.free, standardised, self.n_wheels)
         varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
-        wheels = self._wheels(_varied(soil), active, varied, varied.entry_angle)
-        contact = self._contact(wheels, active, forces_along(wheels.state, wheels.model))
-        load, drawbar, torque, depth = self._predicted(contact, active, varied)
-        surroundings = self._surroundings(latents)
-        pull = self._extra_pull(contact.forces[1].only(int), active, surroundings)
+        # the derivative by k_c is that by k_phi over the width
+        varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
+        wheels = self._wheels(soil._replace(**varied_soil), active, varied, varied.entry_angle)
+        forces = reactions_with(active, forces_along(wheels.state, wheels.model), wheels.state, wheels.surroundings)
+        excess, (_, drawbar, torque) = self._excess_load(forces, wheels, active, varied), forces
+        for effect, values in active:
+            if effect.torque is not None:
+                torque = effect.torque(torque, wheels.surroundings, values)
+        pull = self._extra_pull(drawbar.only(int), active, self._surroundings(latents))
         at, by_latents, by_soil, by_effects = _gathered(
-            (load, drawbar, torque, depth), len(self.free), (self.n, self.n_wheels)
+            (excess, drawbar, torque, wheels.depth), len(self.free), (self.n, self.n_wheels)
         )
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
         pull_by_effects = np.zeros((len(self.free), self.n))
@@ -144,39 +140,18 @@ class ObservationModelWithEffects(ObservationModel):
         state, model = wheel_with(active, state, self.model, surroundings)
         return _Wheels(state, model, sinkage(angle, state.radius), surroundings)
 
-    def _contact(self, wheels: _Wheels, active: Sequence[Active], forces: Forces) -> _Contact:
-        """Contact of wheels and ground, from the integrated forces."""
-        forces = reactions_with(active, forces, wheels.state, wheels.surroundings)
-        return _Contact(forces, wheels.depth, wheels.surroundings)
-
-    def _excess_load(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> Any:
+    def _excess_load(self, forces: Forces, wheels: _Wheels, active: Sequence[Active], latents: Latents) -> Any:
         """Load [N] (N, W) that the soil carries in excess of the latent load."""
-        excess = contact.forces[0] - latents.load
+        excess = forces[0] - latents.load
         for effect, values in active:
             if effect.load is not None:
-                excess = excess + effect.load(contact.surroundings, values)
+                excess = excess + effect.load(wheels.surroundings, values)
         return excess
-
-    def _predicted(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> tuple[Any, Any, Any, Any]:
-        """Excess load [N], drawbar pull [N], predicted torque measurement [N m] and sinkage [m] (N, W)."""
-        _, pull, torque = contact.forces
-        for effect, values in active:
-            if effect.torque is not None:
-                torque = effect.torque(torque, contact.surroundings, values)
-        return self._excess_load(contact, active, latents), pull, torque, contact.depth
 
     def _extra_pull(self, pull: Dual, active: Sequence[Active], surroundings: Surroundings) -> Any:
         """Pull [N] (N,) asked of the wheels beyond the measured demand; pull (N, W) [N] is the wheels' own."""
-        missing, draft = self._unmeasured(active, surroundings, pull.sum(axis=1))
-        return missing + draft - self.draft
-
-    def _unmeasured(self, active: Sequence[Active], surroundings: Surroundings, pull: Any) -> tuple[Any, Any]:
-        """Resistances [N] (N,) that no sensor measures, and drafts [N] (N,) less the sensor errors of effects.
-
-        Both use the draft and the acceleration estimated from the whole balance, not their
-        measurements: a measurement's own noise, beside an error proportional to it, would
-        make a larger draft and a smaller mass fit better (errors in variables).
-        """
+        # Draft and acceleration are those estimated from the whole balance: a measurement's own noise, beside an error
+        # proportional to it, would make a larger draft and a smaller mass fit better (errors in variables).
 
         def resistance(surroundings: Surroundings) -> Any:
             parts = [
@@ -185,25 +160,19 @@ class ObservationModelWithEffects(ObservationModel):
             return sum(parts, np.zeros(self.n))
 
         draft = true_draft(active, self.draft, surroundings)
-        off = self.inertia + draft + resistance(surroundings) - pull
-        by_draft, by_acceleration = self._noise_shares
+        off = self.inertia + draft + resistance(surroundings) - pull.sum(axis=1)
+        # shares of draft [1] and acceleration [1/kg] in a residual of 1 N of the balance, by their noise
+        mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
+        by_draft, by_acceleration = (
+            np.divide(variance, self.demand_var, out=np.zeros(self.n), where=self.draft_var > 0.0)
+            for variance in (self.draft_var, mass * self.acceleration_var)
+        )
         estimated = surroundings._replace(acceleration=surroundings.acceleration - (by_acceleration * off)[:, None])
         errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
         if errors:
             true = draft - by_draft * off
             draft = self.draft - sum(error(true, estimated, values) for error, values in errors)
-        return resistance(estimated), draft
-
-    @property
-    def _noise_shares(self) -> tuple[Array, Array]:
-        """Shares of draft [1] and acceleration [1/kg] (N,) in a residual of 1 N of the balance, by their noise."""
-        mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
-        known = self.draft_var > 0.0
-        by_draft, by_acceleration = (
-            np.divide(variance, self.demand_var, out=np.zeros(self.n), where=known)
-            for variance in (self.draft_var, mass * self.acceleration_var)
-        )
-        return by_draft, by_acceleration
+        return resistance(estimated) + draft - self.draft
 
     def _surroundings(self, latents: Latents) -> Surroundings:
         chassis = self.rig.chassis
@@ -222,12 +191,10 @@ class ObservationModelWithEffects(ObservationModel):
         )
 
     def delay_terms(self, gains: Array) -> DelayTerms | None:
-        """Corrections for measurements y that are late by d: x(t) = y(t + d).
+        """Corrections for measurements y that are late by d: x(t) = y(t + d) = s(t + d) + c (y(t) - s(t)).
 
-        y(t + d) = s(t + d) + c (y(t) - s(t)) with the smooth curve s of the measurements (see
-        local_cubics): the noise of an instant stays with it, and c keeps its variance.  Else every
-        delay would pair other noises or cancel a part, and some would seem to fit better.
-        A low pass delays by its time constant.
+        The noise beside the smooth curve s stays with its instant, and c keeps its variance; else some delay would seem
+        to fit better.  A low pass delays by its time constant.
         """
         places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
         standardised, P = gains[self.layout.effects], len(self.free)
@@ -268,7 +235,7 @@ class ObservationModelWithEffects(ObservationModel):
 
     def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Zero corrections (N, columns) and derivatives (P, N, columns)."""
-        columns = self._curves.number_of(quantity)
+        columns = self.n_wheels if quantity in WHEEL_QUANTITIES else 1
         return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
@@ -282,8 +249,9 @@ class ObservationModelWithEffects(ObservationModel):
 
         def excess(angle: Array) -> Array:
             wheels = self._wheels(soil, active, base, angle)
-            contact = self._contact(wheels, active, wheel_forces(wheels.state, wheels.model))
-            return np.asarray(self._excess_load(contact, active, base))
+            free_of_effects = wheel_forces(wheels.state, wheels.model)
+            forces = reactions_with(active, free_of_effects, wheels.state, wheels.surroundings)
+            return np.asarray(self._excess_load(forces, wheels, active, base))
 
         off = excess(angle)
         with np.errstate(all="ignore"):
@@ -317,14 +285,6 @@ class ObservationModelWithEffects(ObservationModel):
         return wheels.state, wheels.model
 
 
-class _Contact(NamedTuple):
-    """Load [N], drawbar pull [N] and torque [N m] between wheels and ground, sinkage [m] (N, W), surroundings."""
-
-    forces: Forces
-    depth: Any
-    surroundings: Surroundings
-
-
 class _Wheels(NamedTuple):
     """Wheel states and model after the effects' `wheel` hooks, sinkages [m] (N, W), surroundings."""
 
@@ -348,9 +308,3 @@ def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) 
             else:
                 by_soil[i, _SOIL_NAMES.index(quantity)] = d
     return at, by_latents, by_soil, by_effects
-
-
-def _varied(soil: Soil) -> Soil:
-    """The soil with derivatives by each parameter but k_c, whose derivative is that of k_phi over the width."""
-    varied = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
-    return soil._replace(**varied)  # type: ignore[arg-type]

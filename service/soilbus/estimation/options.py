@@ -11,18 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-__all__ = [
-    "ESTIMATOR",
-    "HELD",
-    "EstimatorOptions",
-    "MeasurementOptions",
-    "PosteriorOptions",
-    "SearchOptions",
-    "SolverOptions",
-    "StandingOptions",
-    "TrackerOptions",
-    "VarianceOptions",
-]
+__all__ = ["ESTIMATOR", "HELD", "EstimatorOptions", "SearchOptions", "SolverOptions", "StandingOptions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +23,11 @@ class MeasurementOptions:
     max_side_load: float = 0.8
     """Largest difference of an axle's loads left and right, over their sum [1]: no wheel leaves the ground."""
     load_time_scale: float = 0.1
-    """Integral time scale T [s] of loads that shake, 2 T rms^2 / bin the variance of a bin's: a wheel that is lighter
-    for a moment slips more in it, so that errors of neighbouring bins add up.  With 0.02 s intervals are too narrow."""
+    """Integral time scale T [s] of loads that shake, 2 T rms^2 / bin the variance of a bin's.  With 0.02 s intervals
+    are too narrow."""
     unknown_slope: float = 0.4
-    """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, so that slopes alone take the
-    pull, and of an axle's loads left less right over their sum where no roll is measured: 3 degrees for seconds, of
-    which a window holds few independent ones; 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
+    """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, and of an axle's loads left
+    less right over their sum where no roll is measured: 3 degrees for seconds, 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
     side_slope_share: float = 0.06
     """Sd of an axle's mean loads left less right over their sum [1] on side slopes, where no roll is measured: 3
     degrees."""
@@ -72,9 +60,8 @@ class SolverOptions:
     shortening: float = 0.4
     """Factor [1] on the fraction of the step after a rejected step."""
     max_rise: float = 1.0
-    """Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Steps that
-    overshoot in a curved valley return by themselves.  It is multiplied by `shortening` after each rise, so that a
-    descent does not overshoot for ever."""
+    """Rise of the objective that an accepted step may bring, relative to the objective and one [1]: steps that
+    overshoot in a curved valley return by themselves.  It is multiplied by `shortening` after each rise."""
     max_rejected: int = 6
     """Rejected steps in a row."""
     give_up_above: float = math.inf
@@ -122,8 +109,8 @@ class PosteriorOptions:
 
     max_log_variance: float = 4.0
     """Variance of a parameter's logarithm [1] from which it is open, in what is reported: one that may be anywhere
-    within `bound_sd` prior sd (of 0.83, std = value) is uniform, with 4^2 0.83^2 / 3 = 3.7.  At its bound a parameter
-    that is linear in the fit may have any variance of its logarithm: without this k_phi had an std of 1e155 on snow."""
+    within `bound_sd` prior sd (of 0.83, std = value) has 4^2 0.83^2 / 3 = 3.7.  Without it k_phi had an std of 1e155 on
+    snow."""
     form_discount: float = 3.0
     """Residuals [1] that say as much of the contact's form as one would say without errors of the model that all
     share."""
@@ -151,9 +138,6 @@ class TrackerOptions:
     then change by less than a tenth."""
     significance: float = 25.0
     """Fall of -2 log evidence by two soils instead of one [1] from which a change is accepted: 5 sd of one unknown."""
-    min_rows_per_soil: int = 12
-    """Residuals that each of two soils needs before they are compared: with fewer a border passes for a soil, with many
-    more a soil is found late."""
     min_to_detect: float = 0.3
     """Windows [1] that a soil must fill before a change from it is looked for, that lie before the end of the last
     fit's data and are looked at again, and after a change point during which data that no soil explains may be of a
@@ -182,16 +166,14 @@ class StandingOptions:
     wheel_mass_share: float = 0.03
     """Mass of a wheel over that of the vehicle [1]: 2.4 to 3.6 % of a robot, a tractor and a loader."""
     load: float = 0.04
-    """Lateness of loads beside torque and wheel speed [s]: a cycle of 20 ms and a filter of 20 to 30 ms."""
+    """Lateness of loads and acceleration beside torque and wheel speed [s]: a cycle of 20 ms, a filter of 20 to 30."""
     ground_speed: float = 0.15
     """[s]: a radar 0.05 to 0.15 s, receivers of positions 0.1 to 0.3 s."""
     draft: float = 0.05
     """[s]: as `load`, and a filter against the hitch's vibration."""
-    acceleration: float = 0.04
-    """[s], as `load`."""
 
 
-HELD = StandingOptions(0.0, 0.0, StandingOptions().wheel_mass_share, 0.0, 0.0, 0.0, 0.0)
+HELD = StandingOptions(0.0, 0.0, StandingOptions().wheel_mass_share, 0.0, 0.0, 0.0)
 """None of them."""
 
 
@@ -207,7 +189,7 @@ class VarianceOptions:
     """Least factor on a variance [1]: sensors twice as good as their data sheets say."""
     most: float = 400.0
     """Largest factor on a variance [1]: twenty times the sd of a data sheet, as loads that shake by 12 % have beside
-    cells of 0.8 %."""
+    cells of 0.8 %.  Without it torques of the wrong sign count as noise."""
     least_share: float = 0.02
     """Share of its own noise [1] an instant that corrections of a kind must show for its factor to be learned."""
 

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.options import ESTIMATOR
-from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
     "bearing_pressure",
     "shear_strength",
     "tan_phi",
-    "tyre_modulus",
 ]
 
 PARAMETERS = Soil._fields
@@ -54,12 +52,7 @@ class SoilPrior:
 
     @classmethod
     def from_value_std(cls, values: Mapping[str, tuple[float, float]]) -> SoilPrior:
-        """Return the prior from value and std of each parameter.
-
-        Parameters
-        ----------
-        values
-            (value, std) by parameter, in SI: median, and median times the coefficient of variation.
+        """Return the prior from (median, median times the coefficient of variation) of each parameter, in SI.
 
         Examples
         --------
@@ -97,26 +90,15 @@ class Scalar(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Log-normal posterior of the parameters.
+    """Log-normal posterior of the parameters."""
 
-    Attributes
-    ----------
-    soil
-        In SI: the mean in the window's coordinates (see `gaussian.Gaussian`).
-    log_covariance : (6, 6)
-        Covariance of the parameters' logarithms; rows of held ones are zero.
-    """
-
-    soil: Soil
-    log_covariance: Array
+    soil: Soil  # in SI: the mean in the window's coordinates (see `gaussian.Gaussian`)
+    log_covariance: Array  # (6, 6), of the parameters' logarithms; rows of held ones are zero
 
     def parameters(self) -> dict[str, Estimate]:
         """Return each parameter with its median and the root mean square deviation from it.
 
-        Notes
-        -----
-        E (x / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 for log variance v.  So value +- 1.96 std contains 94
-        to 97 % of the log-normal distribution at every width: it has a long upper tail.
+        E (x / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 for log variance v: value +- 1.96 std holds 94 to 97 %.
         """
         variance = np.diag(self.log_covariance).copy()
         variance[_PHI] = self._covariance(np.eye(len(PARAMETERS))[_PHI][None])[0, 0]
@@ -130,11 +112,9 @@ class Posterior:
         return math.sqrt(max(variance, 0.0))  # rounding may take it below zero
 
     def _covariance(self, by_logs: Array) -> Array:
-        """Covariance (S, S) of scalars with these derivatives (S, 6) by the logarithms.
-
-        First order, but for c: strength is linear in it, so phi follows c itself, which is log-normal, and not its
-        logarithm: E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
-        """
+        """Covariance (S, S) of scalars with these derivatives (S, 6) by the logarithms."""
+        # First order, but for c: strength is linear in it, so phi follows c itself, which is log-normal, and not its
+        # logarithm: E (c / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 in place of v = var(log c).
         covariance, v = by_logs @ self.log_covariance @ by_logs.T, float(self.log_covariance[_C, _C])
         if v <= 0.0:
             return np.asarray(covariance)
@@ -176,12 +156,6 @@ class Posterior:
         step = np.clip(logs, -prior.log_std, prior.log_std)
         return Posterior(Soil(*(np.asarray(self.soil) * np.exp(step)).tolist()), self.log_covariance)
 
-    def distance(self, soil: Soil) -> float:
-        """Return the Mahalanobis distance of a soil, in sd, by all free parameters together."""
-        free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
-        off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
-        return math.sqrt(max(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)), 0.0))
-
     def _estimate(self, scalar: Scalar) -> Estimate:
         return Estimate(scalar.value, self.propagate(scalar.gradient))
 
@@ -205,9 +179,3 @@ def shear_strength(soil: Soil, pressure: float) -> Scalar:
     return Scalar(
         soil.c + pressure * tangent.value, pressure * tangent.gradient + np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     )
-
-
-def tyre_modulus(soil: Soil, width: float) -> Scalar:
-    """Return the lumped modulus K_L [N/m^(n+2)] under a tyre of this width [m] (eq. 35 of Xi et al. 2024)."""
-    value = float(lumped_modulus(soil.k_c, soil.k_phi, width))
-    return Scalar(value, np.array([1.0 / width, 1.0, 0.0, 0.0, 0.0, 0.0]))

@@ -4,28 +4,12 @@ from __future__ import annotations
 
 from soilbus.estimation.linearisation import Work
 
-__all__ = ["SearchBudget"]
-
 
 class SearchBudget:
-    """Token bucket of model evaluations for searches, counted in whole windows, so that a replay is reproducible.
+    """Token bucket of model evaluations (Turner 1986, IEEE Communications 24(10):8), counted in whole windows.
 
-    Parameters
-    ----------
-    rate : float
-        Evaluations that each window adds.
-    burst : float
-        Most evaluations that are kept for later.
-
-    Notes
-    -----
-    A window that follows another needs a few evaluations.  At a start, a border or after a gap
-    a search from many soils is due, and soon succeeds.  Where the model does not describe the
-    data no search succeeds, window after window; the empty bucket then limits the cost.
-
-    References
-    ----------
-    Turner 1986, IEEE Communications 24(10):8.
+    rate: evaluations that each window adds; burst: most that are kept for later.  Where the model does not describe the
+    data no search succeeds, window after window; the empty bucket then limits the cost, and a replay is reproducible.
 
     Examples
     --------

@@ -7,17 +7,16 @@ Equations.  Class i has probability p_i beforehand and soils x ~ N(m_i, S_i) in 
 
 where D, y and V are the information of the posterior minus that of the part of the prior that is only a guess.
 
-A class is a soil of the table with a spread, because no field has exactly the soil of a table.  The spread of
-each row has not been measured, so all have the same one, from repeated measurements (WITHIN_CLASS_SD).
-`unknown` is a soil of another kind, spread as widely as the rows of the table are about their mean.  Held
-parameters are left out, and so is k_c: a window determines at best that it is not large, which no Gaussian of
-its logarithm can say.
+A class is a soil of the table with the spread of repeated measurements (WITHIN_CLASS_SD); `unknown` is spread as widely
+as the rows of the table are about their mean.  Held parameters are left out, and so is k_c: a window determines at best
+that it is not large.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +39,10 @@ No evidence recorded.
 WITHIN_CLASS_SD = {"k_c": 0.5, "k_phi": 0.25, "n": 0.16, "phi": 0.10, "c": 0.45, "K": 0.45}
 """Sd of the logarithm of each parameter within a class [1]; for k_phi that of the bearing pressure.
 
-One prepared sand bed: phi 33.1 deg +- 8.7 %, c +- 58 %, pressure +- 9 %, n +- 16 % (Jayakumar
-et al. 2014, J. Terramech. 54:37, as in the code of its second author).  The two rows of Wong's
-table for one snow differ by 1.4 times these sds: phi 0.12, c 0.36, pressure 0.13, k_c 0.40.
-Within a field: phi up to 12 %, strength 20 to 40 % (Phoon & Kulhawy 1999, Can. Geotech. J.
-36:612).  K is no part of Wong's table: planning figures, right to half of themselves.
+One prepared sand bed: phi 8.7 %, c 58 %, pressure 9 %, n 16 % (Jayakumar et al. 2014, J. Terramech. 54:37).  The two
+rows of Wong's table for one snow differ by 1.4 times these sds.  Within a field: phi up to 12 %, strength 20 to 40 %
+(Phoon & Kulhawy 1999, Can. Geotech. J. 36:612).  K is no part of Wong's table: planning figures, right to half of
+themselves.
 """
 
 _K_C = PARAMETERS.index("k_c")
@@ -92,20 +90,13 @@ class SoilClasses:
 
 
 def guessed(prior: SoilPrior, default: SoilPrior) -> SoilPrior:
-    """Return the prior, made vague where it differs from the default: there somebody knows the field.
-
-    Where it differs, somebody who knows the field has set it.
-    """
+    """Return the prior, made vague where it differs from the default: there somebody who knows the field has set it."""
     is_default = (prior.median == default.median) & (prior.log_std == default.log_std)
     return SoilPrior(prior.median, np.where(is_default, prior.log_std, 1e3))
 
 
-@dataclass(frozen=True)
-class _Evidence:
-    """The likelihood of the data: M independent measurements of combinations of P coordinates.
-
-    direction (M, P) times the coordinates of `parameters` (P,) is value (M,) with variance (M,).
-    """
+class _Evidence(NamedTuple):
+    """M independent measurements: direction (M, P) times P coordinates is value (M,) with variance (M,)."""
 
     parameters: NDArray[np.intp]
     direction: Array

@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 from soilbus.estimation.change_detection import ChangeStatistic, Transition
 
-__all__ = ["ChangePoint", "Reason", "Shown", "SoilState", "TrackerState", "next_state"]
-
 
 class TrackerState(StrEnum):
     """Soil that a window's estimate is of: the same, another, or undecided."""
@@ -81,9 +79,7 @@ class SoilState:
 class Shown(NamedTuple):
     """What a window tells of a change of soil."""
 
-    # why data before the end of `transition` are of another soil than those after it, or before `change` than those
-    # after it; None where they are of the soil of the window before
-    found: Reason | None
+    found: Reason | None  # why its newest data are of another soil than that of the window before; None if of the same
     transition: Transition | None  # the last transition, found now or before
     change: ChangePoint | None  # the change point, where there is one
     mismatch: bool  # whether the fit exceeds its limit of chi-square

@@ -9,12 +9,9 @@ covariance, p the residuals of the prior and P its precision,
     step          H d = -g,   subject to the active bounds
     decrease      of F, predicted for a full step: D = d' H d, its squared length in posterior sd
 
-`Objective` evaluates residuals, Jacobian and prior at an `Iterate` and returns the `QuadraticModel` there.  `minimise`
-is the loop: step, evaluate, accept or reject.  `SolverOptions` holds its numbers, `Termination` says why it ended.
-
 The latents (loads and speeds of each instant) are eliminated from the linear model.  In an objective `as_measured`
-they are held, and F is a function of theta that must fall at each step.  Otherwise they follow each step as the linear
-model predicts, one linearisation late, so that F may rise before it falls further.
+they are held, and F must fall at each step.  Otherwise they follow each step one linearisation late, so that F may rise
+before it falls further.
 """
 
 from __future__ import annotations
@@ -108,17 +105,12 @@ class Objective:
     """-2 log posterior of a window: its residuals and those of its prior, with derivatives.
 
     The prior of the soil sets the free coordinates (F), joint_prior is of soil and gains for this window; ValueError
-    where it has no proper covariance. as_measured: the latents are held as measured, and the sensors' gains too; far
-    from the optimum they would absorb the residuals of a wrong soil.  Gains and effect parameters that are not held and
-    have a variance are active (A).
+    where it has no proper covariance.  Gains with a variance are active (A). as_measured: latents and sensors' gains
+    are held, which far from the optimum would absorb the residuals of a wrong soil.
     """
 
     def __init__(
-        self,
-        problem: ObservationModel,
-        prior: SoilPrior,
-        joint_prior: Gaussian,
-        as_measured: bool = False,
+        self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, as_measured: bool = False
     ) -> None:
         self.problem, self.joint_prior, self.options = problem, joint_prior, problem.options.search
         self.coordinates = coordinates_of(prior, problem.rig.mean_width, self.options)
@@ -142,8 +134,6 @@ class Objective:
     def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
         """Return the same window under another joint prior."""
         return Objective(self.problem, self.coordinates.prior, joint_prior)
-
-    # Iterates
 
     def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
         """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's, with the latents as measured.
@@ -211,8 +201,6 @@ class Objective:
         bounds[: len(of_soil), : len(self.free)] = of_soil
         bounds[len(of_soil) + np.arange(len(own)), len(self.free) + own] = sides[own]
         return bounds
-
-    # Residuals, Jacobian, prior: the quadratic model
 
     def quadratic_model(self, iterate: Iterate) -> WindowModel | None:
         """Return the quadratic model at an iterate; None where the observation model is not finite there."""
@@ -405,8 +393,7 @@ def _solution(information: Array, right: Array) -> Array | None:
     """information^-1 right (F, M); None where the information is singular."""
     scale = 1.0 / np.sqrt(information.diagonal())
     try:
-        return np.asarray(
-            np.linalg.solve(information * scale[:, None] * scale, right * scale[:, None]) * scale[:, None]
-        )
+        solved = np.linalg.solve(information * scale[:, None] * scale, right * scale[:, None])
     except np.linalg.LinAlgError:
         return None
+    return np.asarray(solved * scale[:, None])

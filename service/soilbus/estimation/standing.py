@@ -5,11 +5,7 @@
     torque     T = T_soil + J domega/dt                          inertia J of a wheel
     channel    y(t) = x(t - d),   x = y + d dy/dt                d: lateness beside torque and wheel speed
 
-Each parameter is one more gain with a prior of mean 0.  What it changes is linearised at 0, as L / V and d are short
-beside a second.  Its posterior is the prior of the next window.
-
-References
-----------
+Each parameter is one more gain with a prior of mean 0, linearised at 0, as L / V and d are short beside a second.
 Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness: Ljung, System Identification (1999).
 """
 
@@ -21,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.estimation.instrumentation import rows_in
 from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
@@ -48,8 +45,8 @@ def standing_std(rig: Rig) -> list[float]:
     options: StandingOptions = rig.options.standing
     if rig.chassis is None:
         return [0.0] * len(STANDING)
-    return [options.relaxation_length, options.wheel_inertia, options.load, options.ground_speed, options.draft,
-            options.acceleration]  # fmt: skip
+    late = [options.load, options.ground_speed, options.draft, options.load]
+    return [options.relaxation_length, options.wheel_inertia, *late]
 
 
 def wheel_inertia(rig: Rig) -> Array:
@@ -77,12 +74,7 @@ def standing_columns(window: Window, rig: Rig, slopes: Mapping[str, Array] | Non
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
     columns.torque[:, :, 1] = -wheel_inertia(rig) * speed
-    columns.latents[:, :W, 2] = load if _measures_loads(rig) else 0.0
+    columns.latents[:, :W, 2] = load if all(row.kind == "channel" for row in rows_in(rig, "load")) else 0.0
     columns.latents[:, 2 * W, 3], columns.demand[:, 4] = ground, draft
     columns.demand[:, 5] = rig.chassis.mass * acceleration
     return columns
-
-
-def _measures_loads(rig: Rig) -> bool:
-    given = rig.instrumentation
-    return given is None or all(row.kind == "channel" for row in given.load)

@@ -18,7 +18,7 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -46,14 +46,6 @@ from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window, window_of_sam
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
-
-__all__ = [
-    "Settings",
-    "Tracker",
-    "TrackerOutput",
-    "gain_errors",
-    "new_soil_prior",
-]
 
 _SOIL = len(PARAMETERS)
 
@@ -123,19 +115,7 @@ class _Explanation(NamedTuple):
 class Tracker:
     """Recursive estimator over windows; it holds all state from window to window.
 
-    Parameters
-    ----------
-    rig : Rig
-        Wheels, geometry and sensor noise.
-    prior : SoilPrior
-        Configured prior of the soil.
-    model : WheelModel
-        Wheel-soil model without effects.
-    settings : Settings
-    effects : Sequence of Effect
-        Effects of the model.
-    free : Sequence of Free
-        Their parameters.
+    prior: the configured one of the soil; model: without effects; effects, free: of the model, and their parameters.
     """
 
     def __init__(
@@ -329,15 +309,13 @@ class Tracker:
         return one
 
     def _two_soils(self, present: _Present, one: _Explanation, change: ChangePoint) -> _Explanation | None:
-        """The window as two soils, the second from the change point on; None where one soil is not much less likely.
-
-        Without a last fit, or with too few data of the first soil, the second soil is fitted alone.  Where too few
-        data are of the second, the window's data before the change point.
-        """
+        """The window as two soils, the second from the change point on; None where one soil is not much less likely."""
+        # Without a last fit, or with too few data of the first soil, the second soil is fitted alone; where too few
+        # data are of the second, the window's data before the change point.
         window, end = present.window, present.end
         first = self._problem(window.rows(np.flatnonzero(window.t < change.t - TIME_TOLERANCE)))
         warm = None
-        if one.warm is not None and self._fit is not None and first.n_rows >= self.options.min_rows_per_soil:
+        if one.warm is not None and self._fit is not None and first.n_rows >= self.settings.min_rows:
             warm = warm_start(first, self.soil_prior, self._fit, present.joint_prior)
         old = None if warm is None else fit_warm(warm)
         old = None if self.mismatch(old) else old
@@ -345,9 +323,7 @@ class Tracker:
             return None
         joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
         candidates = self._candidate_transitions(change, float(window.t[0]))
-        new = self._after_transition(
-            window, candidates, self._new_soil_prior, joint_prior, lambda fit: not self.mismatch(fit)
-        )
+        new = self._after_transition(window, candidates, joint_prior)
         if new is not None and new.transition is not None:
             separated = without_transition(window, new.transition, self.rig.ahead)
             whole = present._replace(window=separated, problem=self._problem(separated))
@@ -360,25 +336,18 @@ class Tracker:
         return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
 
     def _after_transition(
-        self,
-        window: Window,
-        transitions: Iterable[Transition],
-        prior: SoilPrior,
-        joint_prior: Gaussian,
-        is_one_soil: Callable[[Fit], bool],
+        self, window: Window, transitions: Iterable[Transition], joint_prior: Gaussian
     ) -> _Explanation | None:
-        """The data after the first of some transitions, of growing length, that leaves one soil.
-
-        None where none does, or too few data are left.
-        """
+        """The data after the first of some transitions that leaves one new soil; None where none does."""
+        prior = self._new_soil_prior
         for transition in transitions:
             separated = without_transition(window, transition, self.rig.ahead)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
             arrived = transition.end + transition.lag if self._state.mismatch else transition.end
-            if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
+            if problem.n_rows < self.settings.min_rows or window.t[-1] < arrived:
                 return None  # after a mismatch both axles and the draft must agree on the new soil
             fit = self._search(problem, prior, joint_prior)
-            if fit is not None and is_one_soil(fit):
+            if not self.mismatch(fit):
                 return _Explanation(Objective(problem, prior, joint_prior), fit, transition.end, None, None, transition)
         return None
 
@@ -445,13 +414,9 @@ class Tracker:
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
         """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
         if self._last_run is not None:
-            joint_prior = prior_from_last_run(
-                self._last_run[0],
-                self.soil_prior,
-                problem.gain_std,
-                self._last_run[1],
-                self.options.gain_correlation_time,
-            )
+            last, elapsed = self._last_run
+            correlation_time = self.options.gain_correlation_time
+            joint_prior = prior_from_last_run(last, self.soil_prior, problem.gain_std, elapsed, correlation_time)
             if passes_prior_conflict_test(problem, self.soil_prior, joint_prior):
                 return joint_prior
             self._last_run = None
@@ -481,20 +446,19 @@ class Tracker:
         return replace(fit, mode=mode, form=form)
 
     def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:
-        """Part of a fit that the form of the model leaves open; None where the form is held."""
+        """What the form of the model leaves open of a fit; None where the form is held."""
         if not any(self.settings.form):
             return None
-        prior = FormPosterior.of(self.settings.form, len(fit.gains))
-        if objective.joint_prior.form is not None:
-            prior = replace(prior, by_form=objective.joint_prior.form.by_form)
+        prior, carried = FormPosterior.of(self.settings.form, len(fit.gains)), objective.joint_prior.form
+        if carried is not None:
+            prior = replace(prior, by_form=carried.by_form)
         with np.errstate(all="ignore"):
             return form_posterior(objective, fit, prior)
 
     def _store(self, tracked: TrackerOutput, state: SoilState, end: float, problem: ObservationModel) -> None:
         """Store the result for later windows; a mismatch does not become a prior."""
-        fit, self._state, self._fit = tracked.fit, state, None
-        if fit is not None and fit.converged:
-            self._fit = fit
+        fit, self._state = tracked.fit, state
+        self._fit = fit if fit is not None and fit.converged else None
         if fit is None or tracked.mismatch:
             return
         self._good_until = end

@@ -7,9 +7,8 @@ With e = S^-1 r the weighed residuals of an instant and A their derivatives by t
     factor       f = sum over blocks of (sum of v / sqrt V)^2  /  sum of shares           blocks of one second
 
 so that f V is the variance that corrections of this kind have in the mean over a second (Foerstner 1979, Allg. Verm.
-Nachr. 86:446; blocks: Newey & West 1987, Econometrica 55:703).  Errors that follow each other, of the model or of a
-machine that shakes, so have the weight of few independent ones.  The factor is never less than that of single
-instants: noise that averages out within a second is still in each instant's loads and speeds.
+Nachr. 86:446; blocks: Newey & West 1987, Econometrica 55:703).  The factor is never less than that of single instants:
+noise that averages out within a second is still in each instant's loads and speeds.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import Row
 from soilbus.estimation.linearisation import RESIDUAL, Linearisation, Optimum
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import VarianceOptions
@@ -50,17 +48,17 @@ class VarianceComponents:
                 variance[quantity] = factor * variance[quantity]
         given, observations = rig.instrumentation, window.observations
         if given is not None and observations is not None:
-            torque = [self._of_row(row, "torque", "") for row in given.torque]
-            load = [self._of_row(row, "load", "computed_load") for row in given.load]
-            speed = [self._of_row(row, "speed", "") for row in given.speed]
+            torque, load, speed = (
+                [self.factor.get(measured if row.kind == "channel" else computed, 1.0) for row in rows]
+                for rows, measured, computed in (
+                    (given.torque, "torque", ""), (given.load, "load", "computed_load"), (given.speed, "speed", ""),
+                )
+            )  # fmt: skip
             latents = np.array([*load, *speed, self.factor.get("ground_speed", 1.0)])
             observations = observations._replace(
                 torque_var=observations.torque_var * torque, variance=observations.variance * latents
             )
         return replace(window, variance=variance, observations=observations)
-
-    def _of_row(self, row: Row, measured: str, computed: str) -> float:
-        return self.factor.get(measured if row.kind == "channel" else computed, 1.0)
 
     def after(self, found: Mapping[str, float], whole: bool = False) -> VarianceComponents:
         """Return the components after a window whose corrections are `found` times those expected; whole: replaced."""

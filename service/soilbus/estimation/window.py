@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -57,52 +56,37 @@ has its resolution and its zero error.  No evidence recorded."""
 
 
 class SensorNoise(NamedTuple):
-    """Noise of a channel.
+    """Noise of a channel; the first three add in quadrature."""
 
-    absolute: sd of a sample in SI; relative: sd over its value; of_mean: sd over the channel's
-    mean magnitude in the window; the three add in quadrature.  gain: sd of a constant relative gain error.
-    """
-
-    absolute: float = 0.0
-    relative: float = 0.0
-    of_mean: float = 0.0
-    gain: float = 0.0
+    absolute: float = 0.0  # sd of a sample in SI
+    relative: float = 0.0  # sd over its value
+    of_mean: float = 0.0  # sd over the channel's mean magnitude in the window
+    gain: float = 0.0  # sd of a constant relative gain error
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The vehicle or test rig: W wheels, their geometry, the sensors' noise.
-
-    radius and width [m] have shape (W,); ahead (W,) is the distance to the last axle over the wheelbase, 1 on the front
-    axle; chassis is None for a test rig, whose drawbar pull is measured as draft.
-    """
+    """The vehicle or test rig: W wheels, their geometry, the sensors' noise."""
 
     wheels: tuple[str, ...]
-    radius: Array
+    radius: Array  # (W,) [m], as width
     width: Array
-    ahead: Array
-    chassis: Chassis | None
+    ahead: Array  # (W,), distance to the last axle over the wheelbase: 1 on the front axle
+    chassis: Chassis | None  # None for a test rig, whose drawbar pull is measured as draft
     noise: Mapping[str, SensorNoise]
-    track: float | None = None
-    """Distance [m] between the left and the right wheels, where known."""
-    driven: NDArray[np.bool_] | None = None
-    """(W,), which wheels a motor can drive; None for all."""
+    track: float | None = None  # distance [m] between the left and the right wheels, where known
+    driven: NDArray[np.bool_] | None = None  # (W,), which wheels a motor can drive; None for all
+    # what is measured, where that is not a torque, a speed and a load of each wheel
     instrumentation: Instrumentation | None = None
-    """What is measured, where that is not a torque, a speed and a load of each wheel."""
+    # names (W,) of a quantity's columns in the raw window, where these are not the wheels'
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Names (W,) of a quantity's columns in the raw window, where these are not the wheels'."""
-    towing: str = "measured"
-    """As `config.model.Vehicle.towing`."""
-    specific_force: bool = False
-    """Whether the accelerometer measures dv/dt + g sin(pitch)."""
+    towing: str = "measured"  # as `config.model.Vehicle.towing`
+    specific_force: bool = False  # whether the accelerometer measures dv/dt + g sin(pitch)
+    # of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed
     max_lateral: float | None = None
-    """Of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed."""
-    lengths: Array | None = None
-    """(W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels."""
-    mass_std: float = 0.0
-    """Relative sd of the mass in `chassis` [1], as far as decisions count it."""
+    lengths: Array | None = None  # (W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels
+    mass_std: float = 0.0  # relative sd of the mass in `chassis` [1], as far as decisions reckon with it
     options: EstimatorOptions = ESTIMATOR
-    """Tuning values of its estimator."""
 
     @property
     def mean_width(self) -> float:
@@ -131,7 +115,8 @@ class Rig:
     @property
     def axles(self) -> list[list[int]]:
         """The wheels of each axle, from the front to the rear."""
-        return [np.flatnonzero(self.ahead == at).tolist() for at in np.unique(self.ahead)[::-1]]
+        ahead = self.ahead.tolist()
+        return [[i for i, at in enumerate(ahead) if at == axle] for axle in sorted(set(ahead), reverse=True)]
 
     @property
     def drives(self) -> NDArray[np.bool_]:
@@ -141,12 +126,10 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Bin means of one window and the variances of those means; nan where missing.
+    """Bin means of one window and the variances of those means, in SI; nan where missing.
 
-    torque [N m], load [N], speed [rad/s], sinkage [m] have shape (N, W); ground_speed
-    [m/s], draft [N], pitch [rad], acceleration [m/s^2], yaw_rate [rad/s] (positive to the
-    left; nan by default) have shape (N,).  `variance` holds an array of the same shape for
-    each.  `curves` are smooth curves of the samples by channel, where computed.
+    The quantities of wheels have shape (N, W), those of the vehicle (N,); yaw_rate is positive to the left.  `variance`
+    holds an array of the same shape for each.  `curves` are smooth curves of the samples by channel, where computed.
     """
 
     t: Array
@@ -165,17 +148,20 @@ class Window:
     roll: Array = field(default_factory=lambda: np.empty(0))
     steering_angle: Array = field(default_factory=lambda: np.empty(0))
     differential_lock: Array = field(default_factory=lambda: np.empty(0))
+    # (N,), -1 where the vehicle reversed before `forward`; empty where it never did
     direction: Array = field(default_factory=lambda: np.empty(0))
-    """(N,), -1 where the vehicle reversed before `forward`; empty where it never did."""
-    observations: Observations | None = None
-    """Of `instrumentation.completed`."""
-    kinematic: bool = False
-    """Whether an acceleration that was a specific force has become dv/dt."""
+    observations: Observations | None = None  # of `instrumentation.completed`
+    kinematic: bool = False  # whether an acceleration that was a specific force has become dv/dt
 
     def __post_init__(self) -> None:
         for quantity in ("yaw_rate", "roll", "steering_angle", "differential_lock"):
             if len(getattr(self, quantity)) != len(self.t):
                 object.__setattr__(self, quantity, np.full(len(self.t), np.nan))
+
+    @property
+    def directions(self) -> Array:
+        """(N,), -1 where the vehicle reversed, else 1."""
+        return self.direction if len(self.direction) else np.ones(len(self.t))
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Window:
         """Return the window with the given bins only; a slice copies nothing."""
@@ -191,29 +177,12 @@ class Window:
 
 
 def forward(window: Window) -> Window:
-    """Return the window with every instant of reversing turned into the same drive forward.
+    """Return the window with every instant of reversing turned into the same drive forward: wheel speeds >= 0.
 
-    Parameters
-    ----------
-    window : Window
-        With signed wheel speeds.
-
-    Returns
-    -------
-    Window
-        With wheel speeds >= 0.
-
-    Notes
-    -----
-    A smooth wheel is its own mirror image: in reverse all quantities along the ground change
-    their sign and no others do.  So wheel speed, torque, draft, pitch, acceleration and yaw
-    rate are negated and the ground speed becomes its magnitude (a radar's has no sign);
-    loads and sinkages stay.  The load transfer is in the measured loads, which stay with their
-    wheels.  Not mirrored is what distinguishes front from rear: which axle runs in the other's
-    ruts, and lugs with a direction.
-
-    A vehicle reverses where more of its wheels turn backward than forward.  The speed of a
-    wheel that turns against the majority is nan, and so are all speeds without a majority.
+    A smooth wheel is its own mirror image: in reverse all quantities along the ground change their sign and no others
+    do; the ground speed becomes its magnitude, as a radar's has no sign.  Which axle runs in the other's ruts is not
+    mirrored.  A vehicle reverses where more of its wheels turn backward than forward.  The speed of a wheel that turns
+    against the majority is nan, and so are all speeds without a majority.
     """
     if not (window.speed < 0.0).any():
         return window
@@ -240,35 +209,21 @@ def forward(window: Window) -> Window:
 def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
     """Return whether the vehicle turns too sharply for one ground speed, at each instant (N,) of a forward window.
 
-    Parameters
-    ----------
-    window : Window
-        From `forward`.
-    rig : Rig
-        Its track [m] is used where known.
-    max_turn : float
-        Relative difference of the rim speeds of an axle above which an instant is in a turn.
+    max_turn: relative difference of the rim speeds of an axle above which an instant is in a turn.
 
     Notes
     -----
-    On a turn of radius R with track B and yaw rate r = V/R, the ground speeds of the two
-    wheels of an axle differ by B r, that is by B/R of their mean V, and each wheel's slip,
-    taken from the speed of the vehicle's middle, is wrong by B/(2 R) (1 - slip).
+    With track B and yaw rate r the ground speeds of an axle's wheels differ by B r.  Where r is known it decides: rim
+    speeds that differ without it are wheel spin.  Without a known track the rim speeds must show a turn to the side of
+    r, by a difference that a possible track explains.
 
-    Where the yaw rate is known it decides: rim speeds that differ without it are wheel spin.
-    With a known track the difference is B r.  Without one the rim speeds must show a turn (see
-    below) to the side of the yaw rate, by a difference that a possible track explains.
+    Without r the rim speeds decide.  In a turn the wheels of one side are the faster ones on every axle, by relative
+    differences within a factor of two (steering angle, tracks), and no greater than about a centre one track away:
+    steered tractors turn about centres at least 1.5 tracks away, and one side that spins while the other stands is at
+    2.  Other patterns are slip.  An axle with an unknown speed or without two wheels is ignored.
 
-    A vehicle that steers by the speeds of its sides slides sideways in every turn; there the ratio of the lateral to
-    the longitudinal sliding speed decides, too.
-
-    Without a yaw rate the rim speeds decide.  In a turn the wheels of the same side are the
-    faster ones on every axle, by relative differences that are equal up to the influence of
-    steering angle (1/2 at 45 degrees) and tracks, and no greater than in a turn about a centre one track away: steered
-    tractors turn about centres at least 1.5 tracks away, and one side that spins while the other stands is at 2.  All
-    other patterns are slip: of one wheel, of one on each axle crosswise (open differentials), of
-    all on one side while the others stand, or of one axle on a side slope.  An axle with an
-    unknown speed or without two wheels is ignored; without any axle no instant is in a turn.
+    A vehicle that steers by the speeds of its sides slides sideways in every turn: the ratio of lateral to longitudinal
+    sliding speed decides, too.
     """
     relative, difference = _rim_differences(window, rig)
     size = np.abs(relative)
@@ -294,12 +249,9 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
 
 
 def _slides(window: Window, rig: Rig, max_lateral: float, difference: Array) -> NDArray[np.bool_]:
-    """Whether the wheels of a skid-steered vehicle slide sideways too much, (N,).
-
-    A wheel half a wheelbase from the centre of yaw slides sideways at yaw L / 2 and along at r omega - V; the shear
-    stress points against both, so that its part along is the share 1 / sqrt(1 + lateral^2) of it.  Without a yaw rate
-    the rim speeds bound it: (right less left) / B, less what the sides slip.
-    """
+    """Whether the wheels of a skid-steered vehicle slide sideways too much (N,)."""
+    # A wheel half a wheelbase from the centre of yaw slides sideways at yaw L / 2 and along at r omega - V.
+    # Without a yaw rate the rim speeds bound it: (right less left) / B, less what the sides slip.
     assert rig.chassis is not None
     yaw = np.abs(window.yaw_rate)
     if rig.track is not None:
@@ -323,13 +275,7 @@ def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:
 
 def pairs(rig: Rig) -> NDArray[np.intp]:
     """Return the left and right wheels (2, P) of the axles that have two; the left one is configured first."""
-    return _pairs(tuple(rig.ahead.tolist()))
-
-
-@cache
-def _pairs(ahead: tuple[float, ...]) -> NDArray[np.intp]:
-    axles = [[i for i, at in enumerate(ahead) if at == axle] for axle in sorted(set(ahead), reverse=True)]
-    return np.array([wheels for wheels in axles if len(wheels) == 2], np.intp).reshape(-1, 2).T
+    return np.array([wheels for wheels in rig.axles if len(wheels) == 2], np.intp).reshape(-1, 2).T
 
 
 class NoiseTable(NamedTuple):
@@ -377,13 +323,11 @@ def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, samples:
 
     worth (N, channels): effective number of independent samples in each bin; 0 where it has no value.
     """
-    variance = _variance_of_means(mean, worth, noise)
-    values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
-    columns: dict[str, Any] = values
-    return Window(t=t, variance=variances, samples=samples, curves={}, **columns)
+    variances = _by_quantity(_variance_of_means(mean, worth, noise), noise.n_wheels)
+    return Window(t=t, variance=variances, samples=samples, **_by_quantity(mean, noise.n_wheels))
 
 
-def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:
+def _by_quantity(table: Array, n_wheels: int) -> dict[str, Any]:
     """The columns of each quantity in a table (N, channels): (N, W) of the wheels, (N,) of the vehicle."""
     wheels = {q: table[:, i * n_wheels : (i + 1) * n_wheels] for i, q in enumerate(WHEEL_QUANTITIES)}
     first = len(WHEEL_QUANTITIES) * n_wheels
@@ -399,8 +343,7 @@ def _variance_of_means(mean: Array, count: Array, noise: NoiseTable) -> Array:
         level = np.where(known, size, 0.0).sum(0) / np.maximum(known.sum(0), 1)
         of_sample += (noise.of_mean * level) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        variance: Array = of_sample / count
-    return variance
+        return np.asarray(of_sample / count)
 
 
 def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: Sequence[str] = ()) -> Window:
@@ -419,12 +362,9 @@ def zero_if_unknown(values: Array) -> Array:
 
 
 def steady(window: Window) -> Window:
-    """Return the window with gaps of pitch, roll and acceleration filled by straight lines.
-
-    For what is to be known in every bin: loads, demand, warning.  A slope does not end where its sensor has no sample.
-    """
+    """Return the window with gaps of pitch, roll and acceleration filled by straight lines, as loads need them."""
     changed: dict[str, Any] = {}
-    variance, direction = dict(window.variance), window.direction if len(window.direction) else np.ones(len(window.t))
+    variance, direction = dict(window.variance), window.directions
     for name, sign in (("pitch", direction), ("acceleration", direction), ("roll", np.ones(len(window.t)))):
         known = np.isfinite(values := getattr(window, name))
         if known.any() and not known.all():
