@@ -9,7 +9,7 @@ import pytest
 
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
-from soilbus.decision.balance import LEVEL, Duty, balance
+from soilbus.decision.balance import Duty, balance
 from soilbus.decision.capability import slip_grid
 from soilbus.decision.wheels import Axles, wheel_table
 from soilbus.estimation.assembly import effects_and_parameters_of, effects_of, rig_of, with_effects
@@ -94,7 +94,7 @@ def test_sensors_and_records_do_not_change_the_pull(effect):
 
 
 @pytest.mark.parametrize("effect", [*ON_WHEELS, "drivetrain_loss=0.05"])
-@pytest.mark.parametrize("duty", [LEVEL, Duty(0.0, None), Duty(None, 0.08)], ids=["level", "grade", "on a slope"])
+@pytest.mark.parametrize("duty", [Duty(), Duty(0.0, None), Duty(None, 0.08)], ids=["level", "grade", "on a slope"])
 def test_every_duty_is_in_balance_with_effects(effect, duty):
     model, soil, slips = completed(effect), SOILS["loam"], slip_grid(0.6)
     table = wheel_table(np.array([soil]), rig_of(CONFIG), model, slips)

@@ -30,6 +30,8 @@ from soilbus.estimation.solver import Iterate, Objective, Solution, Termination,
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
+__all__ = ["Fit", "fit_at", "fit_window"]
+
 
 @dataclass(frozen=True, slots=True)
 class Fit:

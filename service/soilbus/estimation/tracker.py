@@ -47,6 +47,8 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
 
+__all__ = ["Settings", "Tracker", "TrackerOutput", "gain_errors", "new_soil_prior"]
+
 _SOIL = len(PARAMETERS)
 
 
