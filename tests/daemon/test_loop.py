@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 from collections import Counter
 from copy import copy
 from dataclasses import replace
+from typing import ClassVar
 
 import can
 import pytest
 
-from fakes import Bench, Notes, ScriptedBus, drive_messages
-from soilbus.can.dbc_files import load_databases
+from fakes import Bench, FakeClock, ScriptedBus, drive_messages
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
+from soilbus.can.wire import MessageWire
+from soilbus.daemon.notify import Notifier
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.simulator.reference import reference_configuration
 
 DURATION = 16.0
+STAMPED = 0.001
+"""Seconds that the scripted kernel needs from a frame's stamp to the socket."""
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +57,34 @@ def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves
         assert min(beat for beat in beats if beat > end) - end > 0.08
 
 
+def test_a_window_that_the_bus_can_end_waits_for_no_frame_and_says_the_same(recording, monkeypatch):
+    """Frames of the kernel are stamped by a clock that can be asked; here it is the scripted bus's."""
+    sparse = [message for message in recording if message.timestamp % 0.1 < 0.05]
+    benches = [Bench(sparse), Bench(sparse)]
+    benches[0].run(DURATION - 0.5)
+    told = benches[1].wire
+
+    def present(_) -> float:
+        return told.clock.now + told.offset
+
+    def heard_until(_) -> float:
+        waits = told.next < len(told.messages) and told.messages[told.next].timestamp <= present(_)
+        return -math.inf if waits else present(_) - STAMPED
+
+    monkeypatch.setattr(MessageWire, "stamping_time", present)
+    monkeypatch.setattr(MessageWire, "heard_until", heard_until)
+    benches[1].run(DURATION - 0.5)
+    assert len(benches[0].results) == 6
+    assert [r.t for r in benches[1].results] == [r.t for r in benches[0].results]
+    assert [str(r.posterior) for r in benches[1].results] == [str(r.posterior) for r in benches[0].results]
+    late = [
+        [f["at"] + told.offset - r.t for r, f in zip(bench.results, bench.sent("SoilStrength"), strict=True)]
+        for bench in benches
+    ]
+    assert max(late[1]) < STAMPED + 0.001
+    assert min(late[0]) > max(late[1])
+
+
 def test_a_good_drive_passes_the_states_in_order_and_ends_in_go(good):
     states = [str(f["State"]) for f in good.sent("SoilbusStatus")]
     order = list(dict.fromkeys(states))
@@ -59,6 +94,13 @@ def test_a_good_drive_passes_the_states_in_order_and_ends_in_go(good):
     assert ways == {"go"}
     before_first = [f for f in good.sent("Traversability") if f["at"] < good.sent("SoilStrength")[0]["at"]]
     assert {str(f["State"]) for f in before_first} == {"unknown"}
+
+
+def test_values_on_the_bus_are_those_of_the_result(good):
+    for result, frame in zip(good.results, good.sent("SoilStrength"), strict=True):
+        assert frame["Window"] == result.index % 251
+        assert frame["BearingPressure"] == pytest.approx(result.bearing.value / 1e3, abs=0.026)
+        assert str(frame["Status"]) == str(result.status)
 
 
 def test_the_soil_class_on_the_bus_is_the_likeliest_of_the_result(good):
@@ -185,6 +227,23 @@ def test_the_journal_says_once_a_minute_which_input_fails(recording, caplog):
     ]
 
 
+def test_a_bus_on_which_nothing_was_heard_yet_is_no_failure(caplog):
+    bench = Bench([])
+    bench.run(5.0)
+    assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) == "no_frames"
+    assert not caplog.records
+
+
+def test_silence_ends_go_and_is_no_reason_to_stop(recording):
+    bench = Bench(recording)
+    bench.run(DURATION + 6.0)
+    last = bench.sent("Traversability", since=bench.clock.now - 3.0)
+    assert {str(f["State"]) for f in last} == {"unknown"}
+    status = bench.sent("SoilbusStatus")[-1]
+    assert (str(status["State"]), str(status["Reason"])) == ("listening", "no_frames")
+    assert {str(f["SlipWheel1"]) for f in bench.sent("WheelSlip", since=bench.clock.now - 3.0)} == {"not_available"}
+
+
 def test_an_outage_between_two_beats_ends_go_too(recording):
     bench = Bench(recording)
     bench.run(13.5)
@@ -238,6 +297,36 @@ def test_bus_off_ends_go_until_the_controller_is_back(recording):
     assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) not in ("bus_error", "bus_down")
 
 
+def test_an_error_passive_controller_is_told_of_beside_a_valid_state(recording):
+    passive = error_frame(recording[0].timestamp + 12.5, 0x004, 0, 0x20)
+    bench = Bench(sorted([*recording, passive], key=lambda m: m.timestamp))
+    bench.run(DURATION)
+    status = bench.sent("SoilbusStatus")[-1]
+    assert (str(status["State"]), str(status["Reason"])) == ("valid", "bus_error")
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+
+
+def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(recording):
+    begin = recording[0].timestamp
+    ours = Publisher(output_database(reference_configuration()))
+    forged = []
+    for i in range(5):
+        frame, at = ours.frame("Traversability", {"State": "go"}), begin + 2.0 + 0.1 * i
+        forged.append(can.Message(timestamp=at, arbitration_id=frame.arbitration_id, data=frame.data))
+    bench = Bench(sorted([*recording, *forged], key=lambda m: m.timestamp))
+    start = bench.clock.now
+    bench.run(DURATION)
+    health = bench.sent("BusHealth")[-1]
+    assert (health["ForeignFrames"], bench.bus.counts.foreign) == (5, 5)
+    assert bench.service.intake.admission.counts.unknown == 0
+    assert health["Received"] == sum(m.timestamp + start - begin <= health["at"] for m in recording) % 4016 > 0
+    reasons = {round(f["at"] - start, 1): str(f["Reason"]) for f in bench.sent("SoilbusStatus")}
+    told = [t for t, reason in reasons.items() if reason == "foreign_sender"]
+    assert told
+    assert 2.0 <= min(told) <= max(told) <= 2.4 + 3.0 + 0.1
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+
+
 def test_a_second_sender_ends_go(recording):
     forged = can.Message(timestamp=recording[0].timestamp + 13.0, arbitration_id=0x18FF649A, data=bytes(8))
     bench = Bench(sorted([*recording, forged], key=lambda m: m.timestamp))
@@ -261,6 +350,75 @@ def test_stop_says_unknown_last(recording):
     bench.service.run()
     assert str(bench.sent("Traversability")[-1]["State"]) == "unknown"
     assert bench.wire.closed
+
+
+def test_the_output_dbc_decides_the_identifiers(recording, tmp_path):
+    text = output_database(reference_configuration()).as_dbc_string()
+    moved = text.replace(str(0x80000000 | 0x18FF629A), str(0x80000000 | 0x18FF909A))
+    (tmp_path / "moved.dbc").write_text(moved)
+    ours = output_database(reference_configuration()).get_message_by_name("WheelSlip").frame_id
+    assert ours == 0x18FF629A
+    config = reference_configuration([f'output.dbc="{tmp_path / "moved.dbc"}"'])
+    bench = Bench(recording, config)
+    bench.run(1.0)
+    assert 0x18FF909A in {m.arbitration_id for _, m in bench.wire.sent}
+    assert ours not in {m.arbitration_id for _, m in bench.wire.sent}
+
+
+def test_a_window_that_ended_before_the_bus_came_back_says_nothing_of_the_present(recording):
+    begin = recording[0].timestamp
+    bench = Bench([m for m in recording if not 12.9 <= m.timestamp - begin < 13.25])
+    start = bench.clock.now
+    bench.run(12.85)
+    gone = bench.clock.now
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+    bench.away = True
+    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    bench.run(start + 13.2 - gone)  # a window ends meanwhile, and hardly a half second of it is missing
+    bench.away = False
+    bench.run(start + 13.95 - bench.clock.now)
+    assert bench.bus.is_open
+    assert 3 in [result.index for result in bench.results]
+    since = [str(f["State"]) for f in bench.sent("Traversability", since=gone + 0.01)]
+    assert len(since) >= 4
+    assert set(since) == {"unknown"}
+
+
+class Stamped(ScriptedBus):
+    """Hands out messages in the time of the drive, whatever their stamps say."""
+
+    def __init__(self, clock: FakeClock, messages, by: float, since: float) -> None:
+        start = messages[0].timestamp
+        super().__init__(clock, [copy(m) for m in messages], start)
+        self.at = [m.timestamp - self.offset for m in messages]
+        for message in self.messages:
+            message.timestamp += by if message.timestamp >= start + since else 0.0
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        due = self.at[self.next] if self.next < len(self.at) else math.inf
+        if due > self.clock.now + (timeout or 0.0):
+            self.clock.sleep(max(timeout or 0.0, 1e-4))
+            return None
+        self.clock.now = max(self.clock.now, due)
+        self.next += 1
+        return self.messages[self.next - 1]
+
+
+@pytest.mark.parametrize("by", [-3600.0, 20.0])
+def test_a_clock_that_is_set_begins_windows_anew_at_once(recording, by):
+    """With it set ahead the service handed out a window of nothing for each second that never was."""
+    since, window = 7.0, 4.0
+    bench = Bench(recording, reference_configuration([f"estimator.window={window}"]))
+    bench.wire = Stamped(bench.clock, recording, by, since)
+    bench.run(DURATION)
+    start = recording[0].timestamp
+    ends = [r.t - start for r in bench.results]
+    before, after = ends[:-5], ends[-5:]
+    assert before == pytest.approx([4.0, 5.0, 6.0, 7.0][: len(before)], abs=0.01)
+    assert len(before) >= 3  # the last one ends with the old time
+    assert after == pytest.approx([since + by + window + i for i in range(5)], abs=0.02)
+    assert {str(r.status) for r in bench.results} == {"valid"}
+    assert [r.index for r in bench.results] == list(range(len(ends)))
 
 
 def test_garbled_frames_change_nothing_but_a_count(recording):
@@ -327,6 +485,15 @@ def test_a_loop_that_falls_behind_says_so_and_nothing_it_reads_is_fresh(recordin
     assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) != "no_frames"
 
 
+class Told(Notifier):
+    """What systemd hears."""
+
+    texts: ClassVar[list[str]] = []
+
+    def status(self, text: str) -> None:
+        self.texts.append(text)
+
+
 def test_inputs_whose_samples_are_all_refused_are_called_so_and_not_silent(recording):
     loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
     cut = [copy(message) for message in recording]
@@ -334,13 +501,13 @@ def test_inputs_whose_samples_are_all_refused_are_called_so_and_not_silent(recor
         if message.arbitration_id == loads and message.timestamp > recording[0].timestamp + 5.0:
             message.data = message.data[:7]
     bench = Bench(cut)
-    bench.service.notifier = told = Notes()
+    bench.service.notifier = told = Told()
     bench.run(4.9)
     assert bench.sent("SoilbusStatus")[-1]["RejectedShare"] == 0.0
     bench.run(5.0)
     last = bench.sent("SoilbusStatus")[-1]
     assert (str(last["State"]), str(last["Reason"])) == ("degraded", "input_rejected")
-    assert "input_rejected load.FL (wrong_length) load.FR (wrong_length)" in told.said
+    assert "input_rejected load.FL (wrong_length) load.FR (wrong_length)" in told.texts[-1]
     signals = Counter(channel.message for channel in bench.service.intake.channels)
     names = {m.frame_id: m.name for m in load_databases(bench.config).messages}
     second = [names[m.arbitration_id] for m in recording if 8.0 < m.timestamp - recording[0].timestamp < 9.0]
