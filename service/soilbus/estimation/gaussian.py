@@ -62,9 +62,9 @@ class Gaussian:
         outweigh the prior in time.
         """
         at = np.flatnonzero(std > 0.0)
-        precision = np.linalg.inv(self.covariance[np.ix_(_SOIL + at, _SOIL + at)])
-        covariance = np.linalg.inv(kept * precision + np.diag((1.0 - kept) / std[at] ** 2))
-        return self._with_gains(at, kept * covariance @ (precision @ self.gains[at]), covariance)
+        prior, own = np.diag(std[at] ** 2), self.covariance[np.ix_(_SOIL + at, _SOIL + at)]
+        share = np.linalg.solve(kept * prior + (1.0 - kept) * own, prior).T  # (k C^-1 + (1 - k) C_0^-1)^-1 C^-1
+        return self._with_gains(at, kept * share @ self.gains[at], share @ own)
 
     def given(self, at: NDArray[np.intp], gains: Array) -> Gaussian:
         """Return the Gaussian where the gains at these places (K,) have these values (K,)."""
@@ -73,7 +73,8 @@ class Gaussian:
     def _with_gains(self, at: NDArray[np.intp], gains: Array, covariance: Array) -> Gaussian:
         """The Gaussian with another mean (K,) and covariance (K, K) of the gains at these places."""
         old = self.covariance[np.ix_(_SOIL + at, _SOIL + at)]
-        by_gains = np.linalg.solve(old, self.covariance[_SOIL + at]).T
+        sd = np.sqrt(old.diagonal())[:, None]
+        by_gains = (np.linalg.lstsq(old / (sd * sd.T), self.covariance[_SOIL + at] / sd, rcond=None)[0] / sd).T
         moved = by_gains @ (gains - self.gains[at])
         return replace(
             self,
