@@ -168,7 +168,7 @@ class _Curve(NamedTuple):
         return cls(curve.slip[known], curve.pull[known], curve.pull_std[known], gain, noise.draft.gain)
 
     def missing_pull(self, slip: float, pull: float, deviations: float) -> float:
-        """Pull [N] by which the wheels give less than predicted at their slip, beyond so many sd of this innovation."""
+        """Return the pull [N] missing at this slip: predicted less given, less `deviations` sd of that difference."""
         if not len(self.slip) or not math.isfinite(slip + pull) or slip < self.slip[0]:
             return 0.0
         predicted, std = float(np.interp(slip, self.slip, self.pull)), float(np.interp(slip, self.slip, self.std))

@@ -29,8 +29,8 @@ class Margin(NamedTuple):
 
     rows (N, 5): time [s], common slip, pull given [N], demand of draft and slope [N] of the last moments, and demand
     that they foresaw `settling_time` later.  since [s]: of the first moment without a gap.  error, checks: sum of
-    squares of what came less what was foreseen, and their number.  calm [s]: the last moment at which no trend led to
-    the limit.  cause: what is seen now, empty for nothing.
+    squares of what came less what was foreseen, and their number.  calm [s]: the last moment whose trend did not
+    reach the limit.  cause: what is seen now, empty for nothing.
     time_left [s]: until the capacity falls to the demand, inf where it does not; None where it is not known.
     """
 

@@ -239,7 +239,7 @@ class ObservationModelWithEffects(ObservationModel):
         return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
-        """As `ObservationModel.with_entry_angles`; without gains the effect parameters are at their prior values."""
+        """Return the latents with the entry angles that carry their loads; gains None: effects at prior values."""
         solved = np.isfinite(latents.entry_angle).all() and bool(self.effects)
         base = latents if solved else super().with_entry_angles(latents, soil, gains)
         if not self.effects:
