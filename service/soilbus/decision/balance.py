@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.decision.sigma_points import SigmaPoints
-from soilbus.decision.uncertain_model import ModelOfRows
+from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
@@ -85,12 +85,10 @@ class Balance:
         """Entry angle [rad] (D, A, F)."""
         return self._of_kinds(2)
 
-    def drawn(self, points: SigmaPoints) -> Balance:
-        """Return the balance of a posterior's mode and draws (1 + N instead of D), from that of its sigma points."""
-        known = np.broadcast_to(self.known[0], (len(points.share), len(self.slip)))
-        if not self.known.all():
-            known = known & (points.drawn(self.known.astype(float)) > 0.5)
-        return Balance(self.slip, known, points.drawn(self.columns, self.known[:, None]))
+    def filled(self, points: SigmaPoints) -> Balance:
+        """Return the balance at a posterior's sigma points with unknown states mirrored about the mode's."""
+        known = np.broadcast_to(self.known[0], self.known.shape)
+        return Balance(self.slip, known, points.filled(self.columns, self.known[:, None]))
 
 
 class Limits(NamedTuple):
@@ -105,8 +103,8 @@ class Limits(NamedTuple):
     motors: Array
 
     @classmethod
-    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: ModelOfRows) -> Limits:
-        """Return the limits of each kind of wheel on the soils of a model.
+    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: UncertainModel, n: int) -> Limits:
+        """Return the limits of each kind of wheel on n soils, the last of which belong to the perturbed models.
 
         torque_limit: (W,) [N m], nan where not known; max_sinkage [m], converted to an entry angle at the wheels' loads
         on the level.
@@ -121,7 +119,7 @@ class Limits(NamedTuple):
             limit = float(np.array(group.weight) @ torque_limit[list(group.wheels)])
             torque[:A][of_kind > 0.0] = np.inf
             motors, torque = np.vstack([motors, of_kind]), np.append(torque, np.inf if np.isnan(limit) else limit)
-        deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]))
+        deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]), n)
         return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE), motors)
 
     def all(self) -> Array:

@@ -5,8 +5,8 @@
     forecast         the least slip with pull(s) = demand, its sinkage and torque
     efficiency       eta(s) = P (1 - s) / (T / r)         drawbar power over axle power, the set point of each axle
 
-The wheels over slip (`wheels`, `balance`) are computed on the posterior's sigma points and mapped to its mode and
-draws; each quantity is found draw by draw, and `sigma_points` gives its mean and std.
+The wheels over slip (`wheels`, `balance`) and each quantity are computed at the posterior's sigma points;
+`sigma_points` gives mean and std.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from soilbus.decision.balance import (
     largest_pull,
     slips_of_most,
 )
-from soilbus.decision.sigma_points import SigmaPoints, estimates, likely, mean_and_std
-from soilbus.decision.uncertain_model import ModelOfRows, UncertainModel
+from soilbus.decision.sigma_points import SigmaPoints
+from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import Axles, WheelTable, wheel_table
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
@@ -170,17 +170,12 @@ def assess(
     driven, grid = ~(torque_limit <= 0.0), slip_grid(max_slip)
     table = wheel_table(points.soils, rig, uncertain, grid, last, NEWTON_TOLERANCE, driven)
     skids = np.linspace(-MAX_SKID, grid[0], GRID_SLIPS)
-    axles, completed = table.axles, uncertain.of_rows(len(points.soils))
-    limits = Limits.of(axles, torque_limit, max_sinkage, completed)
-    of_points = balance(table)
-    vehicle = _Vehicle(
-        table,
-        of_points,
-        points,
-        limits._replace(angle=points.drawn(limits.angle)),
-        cache(lambda: wheel_table(points.soils, rig, uncertain, skids, driven=driven)),
-    )
-    level = of_points.drawn(points)
+    axles = table.axles
+    limits = Limits.of(axles, torque_limit, max_sinkage, uncertain, len(points.soils))
+    level = balance(table)
+    skidding = cache(lambda: wheel_table(points.soils, rig, uncertain, skids, driven=driven))
+    vehicle = _Vehicle(table, level, points, limits, skidding)
+    level = level.filled(points)
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
@@ -188,16 +183,17 @@ def assess(
     if demand is not None:
         flat = abs(demand.sine) < LEVEL_SINE
         duty = Duty(None, demand.sine)
-        here = of_points if flat else balance(table, duty, of_points)
-        present = level if flat else here.drawn(points)
+        present = level if flat else balance(table, duty, vehicle.level).filled(points)
         pull = draft if flat else vehicle.largest(duty, present)
         with_draft = vehicle.grade(demand.pull - axles.weight * demand.sine)
-        forecast = _forecast(demand, here, present, axles, rig, completed, points)
+        forecast = _forecast(demand, present, axles, rig, uncertain, points)
     pulls = None if pull is None else pull.pull
-    max_draft, max_pull, max_grade, max_grade_with_draft = estimates(draft.pull, pulls, vehicle.grade(0.0), with_draft)
+    max_draft, max_pull, max_grade, max_grade_with_draft = points.estimates(
+        draft.pull, pulls, vehicle.grade(0.0), with_draft
+    )
     if max_draft is None:
         return None, table
-    likely_pull, max_draft_here = likely(pulls), None
+    likely_pull, max_draft_here = points.likely(pulls), None
     max_pull = max_pull and _with_mass_error(max_pull, rig)
     if demand is not None and max_pull is not None:
         max_draft_here = Estimate(max_pull.value - axles.weight * demand.sine, max_pull.std)
@@ -209,9 +205,9 @@ def assess(
         max_pull=max_pull,
         likely_pull=likely_pull and _with_mass_error(likely_pull, rig),
         limit=draft.cause,
-        set_points=_set_points(axles, level, vehicle.limits, draft),
+        set_points=_set_points(axles, level, points, limits, draft),
         forecast=forecast,
-        over_slip=_over_slip(level, table),
+        over_slip=_over_slip(level, table, points),
     ), table
 
 
@@ -221,7 +217,7 @@ def _with_mass_error(pull: Estimate, rig: Rig) -> Estimate:
 
 
 class _Vehicle(NamedTuple):
-    """Table and level balance of driving wheels, of the sigma points; limits of the draws; (lazily) skidding wheels."""
+    """Table, level balance and limits of driving wheels at the sigma points; (lazily) table of skidding wheels."""
 
     table: WheelTable
     level: Balance
@@ -230,7 +226,7 @@ class _Vehicle(NamedTuple):
     skid: Callable[[], WheelTable]
 
     def largest(self, duty: Duty, driving: Balance) -> Largest | None:
-        """Largest pull of each draw under a duty, skidding where motors are weak; None if the mode has none."""
+        """Largest pull on each soil under a duty, skidding where motors are weak; None if the mode has none."""
         found = largest_pull(driving, self.limits)
         if not self.table.axles.driven.any():
             return found._replace(cause="torque")
@@ -243,7 +239,7 @@ class _Vehicle(NamedTuple):
             return None
         if not weak.any():
             return found
-        skidding = balance(self.skid(), duty).drawn(self.points)
+        skidding = balance(self.skid(), duty).filled(self.points)
         pushed = largest_pull(skidding, self.limits)
         pulls = np.where(skidding.known, skidding.pull, np.inf)
         none = ~np.isfinite(pushed.pull) & skidding.known.any(axis=1)
@@ -255,15 +251,17 @@ class _Vehicle(NamedTuple):
         return Largest(np.where(weak, pull, found.pull), np.where(weak, slip, found.slip), cause)
 
     def grade(self, draft: float) -> Array | None:
-        """Steepest slope [rad] (1 + N,) that each draw climbs with a draft [N]."""
+        """Steepest slope [rad] (D,) that the vehicle climbs with a draft [N], on each soil."""
         duty = Duty(draft, None)
-        found = self.largest(duty, balance(self.table, duty, self.level).drawn(self.points))
+        found = self.largest(duty, balance(self.table, duty, self.level).filled(self.points))
         if found is None:
             return None
         return np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0))
 
 
-def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:
+def _set_points(
+    axles: Axles, level: Balance, points: SigmaPoints, limits: Limits, draft: Largest
+) -> dict[str, SetPoint]:
     """Slips of best efficiency P V / (T omega) and of largest pull, by axle; None for an axle that is not driven."""
     of_axles = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
     names = {name: driven for name, kinds in of_axles.items() if (driven := kinds & axles.driven[:, 0]).any()}
@@ -275,22 +273,21 @@ def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) ->
         force = (axles.count[kinds] / axles.radius[kinds] * level.torque[:, kinds]).sum(axis=1)
         pull = (axles.count[kinds] * level.drawbar[:, kinds]).sum(axis=1)
         values += [pull * (1.0 - level.slip) / np.where(force > 0.0, force, -np.inf), pull]
-    slips = estimates(*slips_of_most(np.stack(values), level, limits, draft.slip))
+    slips = points.estimates(*slips_of_most(np.stack(values), level, limits, draft.slip))
     return none | {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
 def _forecast(
-    demand: Demand, here: Balance, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
+    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: UncertainModel, points: SigmaPoints
 ) -> Forecast | None:
     """Slip, sinkage and torque at the least slip that gives the demand; None where most likely no slip does."""
     on = at_pull(present, demand.pull)
     torque = (on(present.torque) * axles.count[:, 0]).sum(axis=1)
     slip = on(np.broadcast_to(present.slip, present.pull.shape))
-    load = axles.loads(*Duty(None, demand.sine).split(here.pull, axles.weight))
-    depth = model.sinkage(here.angle, Wheel(axles.radius, axles.width, ~axles.front, load))
-    depth = on(points.drawn(depth, here.known[:, None]))
-    slip_needed, required, *depths = estimates(slip, torque, *depth.T)
-    likely_depth = likely(depth[:, int(np.argmax(depth[0]))])
+    load = axles.loads(*Duty(None, demand.sine).split(present.pull, axles.weight))
+    depth = on(model.sinkage(present.angle, Wheel(axles.radius, axles.width, ~axles.front, load)))
+    slip_needed, required, *depths = points.estimates(slip, torque, *depth.T)
+    likely_depth = points.likely(depth[:, int(np.argmax(depth[0]))])
     if slip_needed is None or required is None or likely_depth is None:
         return None
     by_kind = [each for each in depths if each is not None]
@@ -298,11 +295,11 @@ def _forecast(
     return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required, likely_depth)
 
 
-def _over_slip(level: Balance, table: WheelTable) -> OverSlip:
+def _over_slip(level: Balance, table: WheelTable, points: SigmaPoints) -> OverSlip:
     """Mean and std of pull and torque at the slips of the coarse grid."""
     known = level.known[:, ::SUBDIVISIONS].copy()
     known[:, 1:] |= level.known[:, SUBDIVISIONS - 1 :: SUBDIVISIONS]
     torque = (level.torque[..., ::SUBDIVISIONS] * table.axles.count).sum(axis=1)
     both = np.where(known[:, None], np.stack([level.pull[:, ::SUBDIVISIONS], torque], axis=1), np.nan)
-    (pull, torque), (pull_std, torque_std) = mean_and_std(both)
+    (pull, torque), (pull_std, torque_std) = points.mean_and_std(both)
     return OverSlip(table.slip, pull, pull_std, torque, torque_std)

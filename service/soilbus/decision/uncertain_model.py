@@ -9,8 +9,7 @@ is independent of the effects.  The model's form (its open structure) is treated
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,8 +23,6 @@ from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.steady import CompletedModel, Slopes, Wheel
 from soilbus.terra.wheel import WheelModel, WheelState
-
-_Rows = slice | NDArray[np.intp]
 
 _SOIL = len(PARAMETERS)
 _HELD_VARIANCE = 1e-8
@@ -97,9 +94,33 @@ class UncertainModel(NamedTuple):
         along = self.shifts[len(self.shifts) - self.of_form :]
         return np.asarray(log_covariance + along.T @ along)
 
-    def of_rows(self, n: int) -> ModelOfRows:
-        """Return the models of n rows of soils; the last rows belong to the perturbed models."""
-        return ModelOfRows((self.mean, *self.perturbed), np.maximum(np.arange(n) - n + len(self.perturbed) + 1, 0))
+    def forces_and_slopes(
+        self, state: WheelState, rear: Any, load: Array, of_row: NDArray[np.intp]
+    ) -> tuple[Array, Slopes]:
+        """Return the forces (3, D, ...) [N, N, N m] at states and loads [N] (D, ...), and the mean model's derivatives.
+
+        of_row (D,): index of each row's perturbed model, negative for the mean.
+        """
+        forces, slopes = self.mean.forces_and_slopes(state, rear, load)
+        for row in np.flatnonzero(of_row >= 0):
+            at = WheelState(*[a if isinstance(a, float) else a[row] for a in state])
+            forces[:, row] = self.perturbed[of_row[row]].forces(at, rear, load[row])
+        return forces, slopes
+
+    def sinkage(self, angle: Array, wheel: Wheel) -> Array:
+        """Return the sinkage [m] (D, A) at entry angles [rad] (D, A) of wheels (A,) with loads (D, A).
+
+        The last rows belong to the perturbed models, here and in `angle_of_sinkage`.
+        """
+        found = self.mean.sinkage(angle, wheel)
+        for row, model in enumerate(self.perturbed, len(angle) - len(self.perturbed)):
+            found[row] = model.sinkage(angle[row], wheel._replace(load=wheel.load[row]))
+        return found
+
+    def angle_of_sinkage(self, depth: float, wheel: Wheel, n: int) -> Array:
+        """Return the entry angle [rad] (n, A) at which wheels (A,) have this sinkage [m]."""
+        first = [self.mean.angle_of_sinkage(depth, wheel)] * (n - len(self.perturbed))
+        return np.stack([*first, *(model.angle_of_sinkage(depth, wheel) for model in self.perturbed)])
 
 
 def _form_steps(form: FormPosterior) -> list[Array]:
@@ -107,52 +128,3 @@ def _form_steps(form: FormPosterior) -> list[Array]:
     variance, axes = np.linalg.eigh(form.spread)
     axes = axes * np.where(form.mean @ axes < 0.0, -1.0, 1.0)
     return [axes[:, i] * np.sqrt(variance[i]) for i in np.flatnonzero(variance > _HELD_VARIANCE)]
-
-
-@dataclass(frozen=True, slots=True)
-class ModelOfRows:
-    """Models for arrays (D, ...): row i belongs to models[row[i]].  Interface and units as CompletedModel."""
-
-    models: tuple[CompletedModel, ...]
-    row: NDArray[np.intp]
-
-    def of(self, rows: NDArray[np.intp]) -> ModelOfRows:
-        """Return the models of some of the rows."""
-        return ModelOfRows(self.models, self.row[rows])
-
-    def forces_and_slopes(self, state: WheelState, rear: Any, load: Array) -> tuple[Array, Slopes]:
-        """Return the forces (3, D, ...) [N, N, N m] and their derivatives at states and loads [N] (D, ...)."""
-
-        def rows(model: CompletedModel, at: _Rows) -> Array:
-            part = WheelState(*[a if isinstance(a, float) else a[at] for a in state])
-            forces, slopes = model.forces_and_slopes(part, rear, load[at])
-            return np.stack([forces, *slopes])
-
-        found = self._by_model(rows, (4, 3, *load.shape), 2)
-        return found[0], Slopes(*found[1:])
-
-    def sinkage(self, angle: Array, wheel: Wheel) -> Array:
-        """Return the sinkage [m] (D, A) at entry angles [rad] (D, A) of wheels (A,) with loads (D, A)."""
-        return self._by_model(
-            lambda model, at: model.sinkage(angle[at], wheel._replace(load=wheel.load[at])), angle.shape
-        )
-
-    def angle_of_sinkage(self, depth: float, wheel: Wheel) -> Array:
-        """Return the entry angle [rad] (D, A) at which wheels (A,) have this sinkage [m]."""
-        shape = (len(self.row), *np.shape(wheel.radius))
-
-        def rows(model: CompletedModel, at: _Rows) -> Array:
-            return np.broadcast_to(model.angle_of_sinkage(depth, wheel), (len(self.row[at]), *shape[1:]))
-
-        return self._by_model(rows, shape)
-
-    def _by_model(self, rows: Callable[[CompletedModel, _Rows], Array], shape: tuple[int, ...], axis: int = 0) -> Array:
-        """An array of this shape, filled by each model for its rows, which lie along `axis`."""
-        if len(self.models) == 1:
-            return np.asarray(rows(self.models[0], slice(None)))
-        out = np.empty(shape)
-        for i, model in enumerate(self.models):
-            at = np.flatnonzero(self.row == i)
-            if len(at):
-                out[(slice(None),) * axis + (at,)] = rows(model, at)
-        return out

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.decision.uncertain_model import ModelOfRows, UncertainModel
+from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.estimation.instrumentation import Group
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
@@ -142,12 +142,13 @@ def wheel_table(
 ) -> WheelTable:
     """Return the steady level driving on D soils at S slips.
 
-    soils (D, 6): the last belong to the perturbed models of an uncertain model.  slip (S,): of the driven wheels.  rig:
-    with a chassis, else ValueError.  start: table of the same rig on similar soils.  tolerance: step of pull and load,
-    as a share of the weight, below which Newton's method stops.  driven (W,): which wheels are driven; None for all.
+    soils (D, 6): the last belong to the perturbed models of an uncertain model, which have the mean's derivatives.
+    slip (S,): of the driven wheels.  rig: with a chassis, else ValueError.  start: table of the same rig on similar
+    soils.  tolerance: step of pull and load, as a share of the weight, below which Newton's method stops.  driven (W,):
+    which wheels are driven; None for all.
     """
     n_soils, n_slips = len(soils), len(slip)
-    completed = UncertainModel.over(model).of_rows(n_soils)
+    uncertain = UncertainModel.over(model)
     drives = np.ones(len(rig.wheels), bool) if driven is None else driven
     if start is not None and not (
         start.pull.shape == (n_soils, n_slips)
@@ -170,23 +171,24 @@ def wheel_table(
     unknown = np.isnan(angle).any(axis=(1, 2))
     if unknown.any():
         guess = _state(soils[unknown], axles, slips[unknown], angle[unknown])
-        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.models[0].model, tolerance=1e-2)
+        angle[unknown] = entry_angle_for_load(load[unknown], guess, uncertain.mean.model, tolerance=1e-2)
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
-        now = _newton_step(soils, axles, completed, slips, pull, load, angle, options.max_rolling_skid)
+        of_row = np.arange(n_soils) - (n_soils - len(uncertain.perturbed))
+        now = _newton_step(soils, axles, uncertain, of_row, slips, pull, load, angle, options.max_rolling_skid)
         for _ in range(MAX_NEWTON_STEPS - 1):
             rows = np.flatnonzero((now.step_size > last_step).any(axis=1))
             if not len(rows):
                 break
             angle[rows] = np.clip(now.at[ANGLE, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
-            at_rows = now.slip[rows], now.pull[rows], now.load[rows], angle[rows]
-            step = _newton_step(soils[rows], axles, completed.of(rows), *at_rows, options.max_rolling_skid)
+            at_rows = of_row[rows], now.slip[rows], now.pull[rows], now.load[rows], angle[rows]
+            step = _newton_step(soils[rows], axles, uncertain, *at_rows, options.max_rolling_skid)
             for whole, part in zip(now, step, strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
     pull, load, at, by_load, by_slip, slips, step_size = now
     balanced = np.isfinite(at[ANGLE]).all(axis=1) & (load > 0.0).all(axis=1) & (step_size <= last_step)
     half_second = _half_second_derivative(
-        soils[:1], axles, completed.models[0], slips[:1], load[:1], at[:, :1], by_load[:, :1]
+        soils[:1], axles, uncertain.mean, slips[:1], load[:1], at[:, :1], by_load[:, :1]
     )
     pull = np.where(balanced, pull, np.nan)
     return WheelTable(axles, soils, slip, pull, load, at, by_load, by_slip, half_second, balanced)
@@ -219,10 +221,11 @@ class _Step(NamedTuple):
 
 
 def _newton_step(
-    soils: Array, axles: Axles, model: ModelOfRows, slip: Array, pull: Array, load: Array, angle: Array, max_skid: float
-) -> _Step:
+    soils: Array, axles: Axles, model: UncertainModel, of_row: NDArray[np.intp], slip: Array, pull: Array, load: Array,
+    angle: Array, max_skid: float,
+) -> _Step:  # fmt: skip
     """One Newton step of entry angles, loads and pull; a wheel that is not driven skids to torque 0, within a limit."""
-    forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)
+    forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load, of_row)
     by_carried = np.stack([d.by_angle[1], d.by_angle[2], np.ones_like(d.by_angle[0])]) / d.by_angle[0]
     by_load = by_carried * (1.0 - d.by_load[0])
     by_load[:2] += d.by_load[1:]
