@@ -16,11 +16,11 @@ from soilbus.decision.balance import Duty, Limits, balance, largest_pull
 from soilbus.decision.capability import Demand, slip_grid
 from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Status
+from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import wheel_table
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
-from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
 from statics import WEIGHT, brute
@@ -74,7 +74,7 @@ def test_spread_of_the_capability_equals_monte_carlo(name, limit):
     way = decide(posterior, limit=limit)
     logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 2000)
     table = wheel_table(np.exp(logs), RIG, MODEL, slip_grid(DEFAULTS.max_slip))
-    limits = Limits.of(table.axles, limit, DEFAULTS.max_sinkage, CompletedModel(MODEL))
+    limits = Limits.of(table.axles, limit, DEFAULTS.max_sinkage, UncertainModel.over(MODEL), len(logs))
     drafts, pulls = (largest_pull(balance(table, duty), limits).pull for duty in (Duty(), Duty(0.0, None)))
     for estimate, sample in ((way.max_draft, drafts), (way.max_grade, np.arcsin(pulls / WEIGHT))):
         assert estimate.std == pytest.approx(np.std(sample), rel=0.1)  # sampling: 1.6 %
