@@ -5,7 +5,8 @@
     takes all      Q > (1 - e) max P_hat, e: how wrong the curve may be, or s > s_max
 
 P: pull given, P_hat: pull over slip of the last window.  The moments are kept and seen along the newest curve: so a new
-window is no new ground.  Trends are regressions whose rows count e^(x / memory), x: time [s] from now.
+window is no new ground.  Trends are regressions whose rows count e^(x / memory), x: time [s] from now.  dQ/dt is a
+slope over 5 s and more: a draft's swings of two or three seconds say nothing of a demand h later.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ class Margin(NamedTuple):
     cause: str = ""
     time_left: float | None = None
 
+    def afresh(self) -> Margin:
+        """Return the margin without its rows; how well demands were foreseen stays known."""
+        return Margin(error=self.error, checks=self.checks)
+
 
 def left_by(
     before: Margin, row: tuple[float, float, float, float], curve: OverSlip | None, options: WatchOptions = WATCH
@@ -50,11 +55,12 @@ def left_by(
     t, slip, *_ = row
     last = float(before.rows[-1, 0]) if len(before.rows) else -math.inf
     if not 0.0 < t - last <= LONGEST_GAP:
-        before, last = Margin(since=t, calm=t), t
+        before, last = before.afresh()._replace(since=t, calm=t), t
     step, age = t - last, t - before.since
     rows = np.vstack([before.rows[before.rows[:, 0] > t - options.warning_time], (*row, math.nan)])
     x = rows[:, 0] - t
-    demand, rise = _line(x, rows[:, 3], options.slow_memory)
+    demand, _ = _line(x, rows[:, 3], options.slow_memory)
+    _, rise = _line(x, rows[:, 3], options.forgetting_time)
     rows[-1, 4] = demand + options.settling_time * rise
     error, checks = before.error, before.checks
     past = rows[x <= 0.5 * step - options.settling_time]

@@ -82,13 +82,13 @@ def watched(
     `warning`.
     """
     now = _stalled(_moved(before, moment, config), before, moment, config, options)
-    margin = before.margin if moment.engaged == before.engaged else Margin()  # another drive has another curve
+    margin = before.margin if moment.engaged == before.engaged else before.margin.afresh()  # along another curve
     if math.isfinite(moment.common + moment.given):
         asked = moment.given - moment.inertia + moment.mass * now.stall.slope
         if not len(margin.rows) or moment.t != margin.rows[-1, 0]:
             margin = left_by(margin, (moment.t, moment.common, moment.given, asked), curve, options)
     elif len(margin.rows) and not 0.0 <= moment.t - float(margin.rows[-1, 0]) <= LONGEST_GAP:
-        margin = Margin()
+        margin = margin.afresh()
     fresh = before.caused if 0.0 <= moment.t - before.caused < options.forgetting_time else -math.inf
     caused = moment.t if margin.cause else fresh
     return seen_at(now._replace(engaged=moment.engaged, margin=margin, caused=caused), moment.t, config, options)
