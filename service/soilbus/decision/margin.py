@@ -129,21 +129,27 @@ def _known(curve: OverSlip) -> tuple[Array, Array, Array, float]:
 
 
 def _time_to_weaken(x: Array, capacity: Array, reserve: Array, peak: float, options: WatchOptions) -> float:
-    """Time [s] until c + b x + e R falls to the peak [N] of demand, e: error of the reserve R; inf if not sure."""
-    known = np.isfinite(capacity)
-    x, capacity, reserve = x[known], capacity[known], reserve[known]
+    """Time [s] until c + b x + e R + d dR/dt falls to the peak [N] of demand without d; inf if not sure.
+
+    e: error of the reserve R; d [s]: how late the pull is beside the slip.
+    """
+    if len(x) < 4:
+        return math.inf
+    moves, known = np.gradient(reserve, x), np.isfinite(capacity)
+    x, capacity, reserve, moves = x[known], capacity[known], reserve[known], moves[known]
     lag = options.scatter_lag
     changes = (capacity - capacity[np.searchsorted(x, x - lag - 1e-6)])[x > x[0] + lag]
     if len(changes) < 4:
         return math.inf
     like = lag * (len(x) - 1) / (x[-1] - x[0])  # rows with the same scatter
     variance = max(float(changes @ changes) / len(changes) / 2.0, 1.0) * like
-    columns, prior = np.stack([np.ones_like(x), x, reserve]), np.diag([0.0, 0.0, options.form_error**-2])
+    columns = np.stack([np.ones_like(x), x, reserve, moves])
+    prior = np.diag([0.0, 0.0, options.form_error**-2, options.lateness**-2])
     left = math.inf
     for memory in (options.slow_memory, options.fast_memory):
         weighted = columns * np.exp(x / memory)
         covariance = np.linalg.inv(weighted @ columns.T / variance + prior)
-        now, slope, error = (covariance @ (weighted @ capacity) / variance).tolist()
+        now, slope, error, _ = (covariance @ (weighted @ capacity) / variance).tolist()
         if slope < -options.significant_sd * math.sqrt(covariance[1, 1]):
             left = min(left, max(now + error * float(reserve[-1]) - peak, 0.0) / -slope)
     return left

@@ -49,6 +49,9 @@ class WatchOptions:
     largest pull warns whatever its trend: in 24 drives on loam where nobody gets stuck it reaches 0.89 of it.  No
     larger std of the largest pull warns earlier.  At 0.08 two furrows of `e-plough-loam` warned, at 0.3 one of
     `b-plough-4wd`."""
+    lateness: float = 0.1
+    """Sd [s] of the time by which pull and slip are late beside each other: sensors of the multibody machines are 0.02
+    to 0.08 s late.  Without it one of 24 drives on loam was warned of as its slip swept up from 0.06."""
     outgrows: float = 0.83
     """Probability that a demand outgrows the ground from which it counts: between the ploughing of `b-plough-4wd`
     (0.80) and the grades of `decisions --boggings`."""
