@@ -138,11 +138,16 @@ def _time_to_weaken(x: Array, capacity: Array, reserve: Array, peak: float, opti
     moves, known = np.gradient(reserve, x), np.isfinite(capacity)
     x, capacity, reserve, moves = x[known], capacity[known], reserve[known], moves[known]
     lag = options.scatter_lag
-    changes = (capacity - capacity[np.searchsorted(x, x - lag - 1e-6)])[x > x[0] + lag]
-    if len(changes) < 4:
+    changes = [
+        (capacity - capacity[np.searchsorted(x, x - apart - 1e-6)])[x > x[0] + apart] for apart in (0.5 * lag, lag)
+    ]
+    if len(changes[-1]) < 4:
         return math.inf
     like = lag * (len(x) - 1) / (x[-1] - x[0])  # rows with the same scatter
-    variance = max(float(changes @ changes) / len(changes) / 2.0, 1.0) * like
+    scatter = max(
+        float(change @ change) / len(change) / 2.0 for change in changes
+    )  # a bounce has the period of the lag
+    variance = max(scatter, 1.0) * like
     columns = np.stack([np.ones_like(x), x, reserve, moves])
     prior = np.diag([0.0, 0.0, options.form_error**-2, options.lateness**-2])
     left = math.inf

@@ -27,10 +27,10 @@ class WatchOptions:
     """Time constant [s] of the trend of ground that softens over many metres, and of a demand's present value."""
     fast_memory: float = 0.8
     """Time constant [s] of the trend of ground at a soft patch's edge."""
-    scatter_lag: float = 0.65
+    scatter_lag: float = 0.5
     """Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground.  For
-    so long a demand must be near the largest pull.  At 0.5 four multibody drives of a loader on two driven wheels had
-    five false warnings, at 0.8 a robot's slope is warned of 0.3 s later."""
+    so long a demand must be near the largest pull.  At 0.4 `e-plough-loam` and `b-2wd-loam` had a false warning
+    each."""
     forgetting_time: float = 5.0
     """Time [s] in which the past is forgotten: how much slip shakes, by how much a reckoned ground speed differs from
     that of the wheels, how fast a demand rises, and the last cause of a warning; ten periods of a vehicle on its tyres.
