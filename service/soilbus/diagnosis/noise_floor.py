@@ -24,7 +24,9 @@ from soilbus.estimation.variance_components import KINDS, corrections
 
 
 def with_noise_floor(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> list[Record]:
-    """Return the records with the noise that differences of a fitted model's corrections show."""
+    """Return the records with the noise that differences of a fitted model's corrections show; tables as they are."""
+    if any(record.source is None for record in records):
+        return list(records)
     found = noise_factors(records, prior, fitted)
     return [
         record.with_noise({kind: record.noise.get(kind, 1.0) * factor for kind, factor in found.items()})
