@@ -214,7 +214,7 @@ class ObservationModel(Measurements):
     def extra_pull(self, gains: Array, latents: Latents, noise: Array | None = None) -> tuple[Array, Array]:
         """Pull [N] (N,) that effects ask of the wheels beyond the measured demand, and its derivatives (P, N).
 
-        noise (N,) [1/N]: S^-1 r of the balance, by which draft and acceleration are freed of their noise; none: as read.
+        noise (N,) [1/N]: S^-1 r of the balance, by which draft and acceleration lose their noise; None: as read.
         """
         return np.zeros(self.n), np.zeros((len(gains) - self.n_sensors, self.n))
 

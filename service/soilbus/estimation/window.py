@@ -194,6 +194,7 @@ def forward(window: Window) -> Window:
     direction = np.where(majority < 0.0, -1.0, 1.0)
     undecided = (majority == 0.0) & (np.abs(turns) > 0.0).any(axis=1)
     speed = direction[:, None] * window.speed
+    curves = {name: _ahead(name.partition(".")[0], curve, window.t, direction) for name, curve in window.curves.items()}
     return replace(
         window,
         speed=np.where((speed < 0.0) | undecided[:, None], np.nan, speed),
@@ -204,7 +205,7 @@ def forward(window: Window) -> Window:
         acceleration=direction * window.acceleration,
         yaw_rate=direction * window.yaw_rate,
         direction=direction,
-        curves={name: _ahead(name.partition(".")[0], curve, window.t, direction) for name, curve in window.curves.items()},
+        curves=curves,
     )
 
 
