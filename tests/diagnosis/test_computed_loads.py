@@ -36,7 +36,6 @@ def test_side_loads_follow_from_equal_torques_and_measured_slips() -> None:
         assert np.abs((latents.load[:, left] - latents.load[:, right] - true) / axle).max() < 0.01
 
 
-@pytest.mark.xfail(strict=True, reason="shaking loads pass for inertia or multipass on this machine, at a gap of 0.5")
 def test_loads_that_shake_are_no_effect() -> None:
     case = case_of("plain", 502, 9)
     case = replace(case, scenario=replace(case.scenario, bounce=0.12, drawn_mass=True))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -19,6 +21,8 @@ from soilbus.terra.soils import SOILS
 SOIL = SOILS["loam"]
 PULL = 0.3
 """Of every parameter, in prior std."""
+NOISE = np.array(0.005)
+"""S^-1 r of the balance [1/N]: one sd of 200 N."""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,7 @@ def at(request, problems):
 def predicted(problem, soil, gains, latents):
     """Drawbar pull, torque and sinkage (3, N, W), and the pull beyond the measured demand (N,)."""
     response = problem._response(soil, gains, latents)
-    return response.value, response.extra_pull
+    return response.value, problem.extra_pull(gains, latents, NOISE)[0]
 
 
 def moved(problem, gains, latents):
@@ -85,7 +89,8 @@ def test_derivatives_are_those_of_the_predictions(at):
             assert np.abs(one - other).max() < 1e-4 * scale, (field, place)
         if field == "by_effects":
             of_pull = (pull_up - pull_down) / (2.0 * step)
-            assert response.extra_pull_by_effects[place[0]] == pytest.approx(of_pull, rel=1e-4, abs=1e-6)
+            by_effects = problem.extra_pull(gains, latents, NOISE)[1]
+            assert by_effects[place[0]] == pytest.approx(of_pull, rel=1e-4, abs=1e-6)
 
 
 def test_predictions_are_the_forces_after_the_hooks(at):
@@ -102,3 +107,28 @@ def test_predictions_are_the_forces_after_the_hooks(at):
         assert response.value[1] == pytest.approx(forces[2], rel=1e-9)
     else:
         assert response.value[1] == pytest.approx(active.effect.torque(forces[2], around, active.values), rel=1e-9)
+
+
+def test_a_mass_share_leaves_the_noise_of_the_readings_in_the_balance(problems):
+    # An acceleration that takes up what loads and slips leave would make any mass share fit better.
+    effect = CATALOGUE["inertia"]
+    free = parameters_of(effect, problems["exponential"].n_wheels)
+    problem = problems["exponential"].with_effects([effect], free)
+    gains = np.zeros(problem.n_sensors + len(free))
+    latents = problem.start(SOIL, None, gains)
+    more = gains + PULL * (np.arange(len(gains)) == problem.n_sensors)
+    balance = [
+        problem.linearise(SOIL, g, latents).rows[:, 0].reshape(problem.n, -1)[:, problem.layout.balance]
+        for g in (gains, more)
+    ]
+    share = PULL * free[0].std * problem.rig.chassis.mass * problem.acceleration * problem.has_balance
+    assert balance[1] - balance[0] == pytest.approx(share, rel=1e-9, abs=1e-6)
+
+
+@pytest.mark.parametrize(("wavelength", "counts"), [(4.0, True), (200.0, False)], ids=["bumps", "hills"])
+def test_a_body_that_pitches_on_bumps_is_noise_of_the_balance(problems, wavelength, counts):
+    problem = copy(problems["exponential"])
+    problem.pitch = 0.02 * np.sin(2.0 * np.pi * problem.distance / wavelength)
+    added = (problem.on_bumps().demand_var - problem.demand_var)[problem.has_balance]
+    swing = (problem.rig.chassis.mass * 9.80665 * 0.02) ** 2 / 2.0
+    assert (added > 0.3 * swing).all() if counts else (added < 0.01 * swing).all()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.assembly import model_of
+from soilbus.estimation.local_cubics import curve_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
@@ -55,6 +56,21 @@ def test_a_drive_in_reverse_gives_the_very_same_estimate(part, signed_ground, lo
 def test_forward_driving_is_left_alone(loam):
     assert forward(loam.window) is loam.window
     assert equal(forward(forward(backwards(loam.window))), loam.window)
+
+
+def test_curves_of_samples_are_mirrored_and_kept_where_the_vehicle_stood(loam):
+    t = loam.window.t
+    way = np.where(t < t[30], -1.0, 1.0)
+    sampled = {
+        "torque.FL": curve_of(t, way * loam.window.torque[:, 0], np.ones(len(t))),
+        "ground_speed": curve_of(t, way * loam.window.ground_speed, np.ones(len(t))),
+        "load.FL": curve_of(t, loam.window.load[:, 0], np.ones(len(t))),
+    }
+    found = forward(dataclasses.replace(backwards(loam.window, slice(0, 30)), curves=sampled)).curves
+    for name, curve in sampled.items():
+        sign = np.ones(len(t)) if name == "load.FL" else way
+        assert np.array_equal(found[name].value, sign * curve.value), name
+        assert np.array_equal(found[name].slope, sign * curve.slope), name
 
 
 def test_slopes_and_draft_point_the_other_way_in_reverse(loam):

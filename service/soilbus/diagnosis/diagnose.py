@@ -125,20 +125,12 @@ def diagnose(
     options = records[0].options
     full = FitCache(records, prior, options)
     base = full.fit(records[0].training.effects)
-    for _ in range(options.noise_rounds if all(record.source is not None for record in records) else 0):
+    for _ in range(2):  # as each kind's noise depends on that of the others
         if base is not None:
-            records = with_noise_floor(records, prior, base)
-            full = FitCache(records, prior, options)
-            base = full.fit(base.effects, [base.as_starts()])
-    if base is not None and any(record.training.computes_loads for record in records):
-        records = [
-            record.with_weights_at(fit.optimum.at, check.at)
-            for record, fit, check in zip(records, base.fits, base.checks, strict=True)
-        ]
-        full = FitCache(records, prior, options)
-        base = full.fit(base.effects, [base.as_starts()])
+            full, base = weighed(full, base, base)
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
+    records = full.records
     thinned = FitCache([record.thinned(options.thinning) for record in records], prior, options)
     law = records[0].training.model.shear_law
     of_law = [effect for effect in catalogue if effect.base_law in (None, law)]
@@ -154,13 +146,13 @@ def diagnose(
         not present.converged and not present.held_out_chi2 < base.held_out_chi2
     ):  # such an end has no evidence, and predicts worse
         additions, present = [], base
-    if additions and all(record.source is not None for record in records):  # the noise without what they explain
+    if additions:  # the noise without what they explain
         progress("finding the noise floor")
-        records = with_noise_floor(records, prior, present)
-        full = FitCache(records, prior, options)
-        again = full.fit(base.effects, [base.as_starts()]), full.fit(present.effects, [present.as_starts()])
-        if again[0] is not None and again[1] is not None:
-            base, present = again[0], again[1]
+        again = weighed(full, present, base)
+        completed = again[0].fit(present.effects, [present.as_starts()])
+        if again[1] is not None and completed is not None:
+            full, base, present = again[0], again[1], completed
+            records = full.records
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     before, after = gap_of(base), gap_of(present)
     imitation = shares_alone(full, base, present, additions)
@@ -172,7 +164,7 @@ def diagnose(
     explains = after.value < before.value
     if verdict is Verdict.UNKNOWN and not explains:  # what explains nothing new is no name
         additions, present, after, imitation = [], base, before, ()
-    remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
+    remaining = residual_terms(records, present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()
     if verdict is Verdict.NONE:
         progress("finding what these recordings could have shown")
@@ -183,6 +175,21 @@ def diagnose(
         rivals = rivals_of(full, present, additions, candidates)
     found = tuple(where), tuple(additions), base, present, tuple(remaining), before, after
     return Diagnosis(verdict, *found, imitation, shown, rivals)
+
+
+def weighed(full: FitCache, noise_by: FittedModel, base: FittedModel) -> tuple[FitCache, FittedModel | None]:
+    """Return the cache and the present model with the noise that `noise_by` shows, and weights of computed loads."""
+    records = with_noise_floor(full.records, full.prior, noise_by)
+    full = FitCache(records, full.prior, full.options)
+    again = full.fit(base.effects, [base.as_starts()])
+    if again is None or not any(record.training.computes_loads for record in records):
+        return full, again
+    records = [
+        record.with_weights_at(fit.optimum.at, check.at)
+        for record, fit, check in zip(records, again.fits, again.checks, strict=True)
+    ]
+    full = FitCache(records, full.prior, full.options)
+    return full, full.fit(base.effects, [again.as_starts()])
 
 
 def rivals_of(

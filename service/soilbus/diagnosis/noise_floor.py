@@ -24,7 +24,9 @@ from soilbus.estimation.variance_components import KINDS, corrections
 
 
 def with_noise_floor(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel) -> list[Record]:
-    """Return the records with the noise that differences of a fitted model's corrections show."""
+    """Return the records with the noise that differences of a fitted model's corrections show; tables as they are."""
+    if any(record.source is None for record in records):
+        return list(records)
     found = noise_factors(records, prior, fitted)
     return [
         record.with_noise({kind: record.noise.get(kind, 1.0) * factor for kind, factor in found.items()})
@@ -38,7 +40,7 @@ def noise_factors(records: Sequence[Record], prior: SoilPrior, fitted: FittedMod
     for record, fit in zip(records, fitted.fits, strict=True):
         assert record.bins is not None
         problem = record.bins.with_effects(fitted.effects, fitted.free)
-        at = check(problem, prior, fit, options=record.options).at
+        at = check(problem, prior, fit).at
         values, of_squares, columns = corrections(problem, at, fit.mode.gains)
         for kind, own in columns.items():
             value, expected = values[:, own], of_squares[:, own]

@@ -150,6 +150,7 @@ def record_of(
         ObservationModelWithEffects(part, diagnosed(rig), model, min_speed, max_turn).with_own_stamps().on_curves()
         for part in (window, averaged(window, end, instant_of(rig, length)))
     )
+    problem = problem.on_bumps()
     fold = folds(problem.since, options)
     is_held_out = fold == options.folds - 1
     parts = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)

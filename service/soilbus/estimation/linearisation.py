@@ -135,8 +135,6 @@ class Response(NamedTuple):
     load_slope: Array  # (N, W), by the entry angle
     load_residual: Array
     by_effects: Array  # (3, P, N, W)
-    extra_pull: Array  # (N,) [N] that effects ask of the wheels beyond the measured demand
-    extra_pull_by_effects: Array  # (P, N)
 
     def rolling(self, free: NDArray[np.bool_]) -> Response:
         """The response with the slips of free wheels (mask (W,)) eliminated by T = 0, to first order.

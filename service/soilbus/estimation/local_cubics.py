@@ -45,6 +45,10 @@ class Curve(NamedTuple):
         value, slope, second = np.mean([self.at(place) for place in places], axis=0)
         return self._replace(value=value, slope=slope, second=second, parts=parts)
 
+    def times(self, factor: Array) -> Curve:
+        """Return the curve of values that are multiplied by a factor (K,) that is constant but at jumps."""
+        return self._replace(value=factor * self.value, slope=factor * self.slope, second=factor * self.second)
+
     def at(self, t: Array) -> tuple[Array, Array, Array]:
         """Return value, slope and second derivative at times t (N,) [s], each interpolated on its own.
 

@@ -205,6 +205,22 @@ class Measurements:
         stamped.n_sensors = len(stamped.gain_names)
         return stamped
 
+    def on_bumps(self) -> Self:
+        """The same with a noise of the balance: bumps shorter than the vehicle pitch its body, and no slope holds it.
+
+        var theta = mean of (theta(x) - 2 theta(x + L) + theta(x + 2 L))^2 / 6 - noise        L: wheelbase
+        """
+        if self.rig.chassis is None or not self.pitch.any():
+            return self
+        speed, step = float(self.ground_speed.mean()), float(np.median(np.diff(self.t)))
+        k = max(round(self.rig.chassis.wheelbase / (speed * step)), 1)
+        bend = self.pitch[2 * k :] - 2.0 * self.pitch[k:-k] + self.pitch[: -2 * k]
+        shaken = max(float((bend**2).mean()) / 6.0 - self.pitch_noise, 0.0) if len(bend) else 0.0
+        bumpy, added = copy(self), (self.rig.chassis.mass * GRAVITY) ** 2 * shaken * self.has_balance
+        bumpy.demand_var, bumpy._row_var = self.demand_var + added, self._row_var.copy()
+        bumpy._row_var[:, self.n_wheels] += added
+        return bumpy
+
     def on_curves(self) -> Self:
         """The same with latents on smooth curves of what is measured, where two wheels share a torque and their load.
 
@@ -274,7 +290,7 @@ class Measurements:
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""
         self.draft, draft_var, known = take("draft")
-        self.with_pitch = False
+        self.with_pitch, self.pitch_noise = False, 0.0
         inertia, inertia_var = np.zeros_like(self.draft), np.zeros_like(self.draft)
         acceleration, acceleration_var = np.zeros_like(inertia), np.zeros_like(inertia)
         self.pitch = np.zeros_like(inertia)
@@ -282,6 +298,7 @@ class Measurements:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
             self.with_pitch = bool(has_pitch.any())
+            self.pitch_noise = float(pitch_var[has_pitch].mean()) if self.with_pitch else 0.0
             if self.rig.specific_force:  # it holds the slope: pitch is needed for dv/dt only, and its noise cancels
                 pitch_var = np.zeros_like(pitch_var)
             elif self.with_pitch:

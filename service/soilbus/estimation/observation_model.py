@@ -106,11 +106,12 @@ class ObservationModel(Measurements):
         rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
         residual[:, torques] = self.torque * of_torque - torque
-        residual[:, balance] = inertia + draft + at.extra_pull - at.value[0].sum(1)
+        extra, extra_by_effects = self.extra_pull(gains, latents)
+        residual[:, balance] = inertia + draft + extra - at.value[0].sum(1)
         by_soil[:, torques] = self.torque_rows(-at.by_soil[1]).transpose(1, 2, 0)
         by_soil[:, balance] = -at.by_soil[0].sum(2).T
         by_effects[:, torques] = self.torque_rows(-at.by_effects[1]).transpose(1, 2, 0)
-        by_effects[:, balance] = (at.extra_pull_by_effects - at.by_effects[0].sum(2)).T
+        by_effects[:, balance] = (extra_by_effects - at.by_effects[0].sum(2)).T
         if self.with_sinkage:
             residual[:, sinkages] = self.sinkage - at.value[2]
             by_soil[:, sinkages] = -at.by_soil[2].transpose(1, 2, 0)
@@ -147,9 +148,11 @@ class ObservationModel(Measurements):
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
         inverse = self.inverse_covariance(A, variance, row_var)
+        # draft and inertia without their noise, which S^-1 r says: an error times noise would fit better when smaller
+        noise = self.has_balance * (inverse[:, balance] * residual).sum(1)
+        _, quiet_by_effects = self.extra_pull(gains, latents, noise)
+        by_effects[:, balance] += (self.has_balance * (quiet_by_effects - extra_by_effects)).T
         if by_sensors:
-            # draft and inertia without their noise, which S^-1 r says: a gain times noise would fit better when smaller
-            noise = (inverse[:, balance] * residual).sum(1)
             true_draft = self.has_balance * (draft - self.draft_noise * of_draft**2 * noise)
             by_gain[:, balance, layout.draft_gain] = -of_draft * true_draft
             if self._mass_gain is not None:
@@ -207,6 +210,13 @@ class ObservationModel(Measurements):
         if self.computes_loads:
             held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
         return held
+
+    def extra_pull(self, gains: Array, latents: Latents, noise: Array | None = None) -> tuple[Array, Array]:
+        """Pull [N] (N,) that effects ask of the wheels beyond the measured demand, and its derivatives (P, N).
+
+        noise (N,) [1/N]: S^-1 r of the balance, by which draft and acceleration lose their noise; None: as read.
+        """
+        return np.zeros(self.n), np.zeros((len(gains) - self.n_sensors, self.n))
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
         """Observations (N, S) of loads left less right after a Newton step from those `now` to equal torques (N, W)."""
@@ -278,8 +288,6 @@ class ObservationModel(Measurements):
             load_slope=slope,
             load_residual=off,
             by_effects=np.zeros((3, 0, *shape)),
-            extra_pull=np.zeros(self.n),
-            extra_pull_by_effects=np.zeros((0, self.n)),
         )
 
     def _by_slip_and_soil(self, d: Array, soil: Soil) -> Array:

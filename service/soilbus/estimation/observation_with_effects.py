@@ -68,18 +68,9 @@ class ObservationModelWithEffects(ObservationModel):
         self._named = {effect.name: effect for effect in self.effects}
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
-        self.gain_std = np.concatenate([self._sensor_std(), std])
+        self.gain_std = np.concatenate([self.sensor_std, std])
         bounds = np.array([f.bounds for f in self.free]).reshape(-1, 2)
         self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
-
-    def _sensor_std(self) -> Array:
-        """Prior sd of the sensors' gains; a channel that an effect delays, but a torque, has no lateness beside it."""
-        # two shifts of opposite sign would leave a second difference, which takes up noise
-        fitted = {(f.effect, f.parameter.name) for f in self.free if f.std > 0.0}
-        late = [q for e in self.effects for q, names in e.late.items() if (e.name, names.delay) in fitted]
-        names, std = [name.split(".") for name in self.gain_names[: self.n_sensors]], self.sensor_std.copy()
-        std[[i for i, name in enumerate(names) if name[0] == "lateness" and name[1] in late and len(name) == 2]] = 0.0
-        return std
 
     def active(self, standardised: Array) -> list[Active]:
         """The effects with their values at standardised parameters (P,)."""
@@ -99,14 +90,10 @@ class ObservationModelWithEffects(ObservationModel):
         for effect, values in active:
             if effect.torque is not None:
                 torque = effect.torque(torque, wheels.surroundings, values)
-        pull = self._extra_pull(drawbar.only(int), active, self._surroundings(latents))
         at, by_latents, by_soil, by_effects = _gathered(
             (excess, drawbar, torque, wheels.depth), len(self.free), (self.n, self.n_wheels)
         )
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
-        pull_by_effects = np.zeros((len(self.free), self.n))
-        for i in range(len(self.free)):
-            pull_by_effects[i] = slope_of(pull, i)
         by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
         by_carried_load = by_angle[1:] / slope  # derivatives by the load through the entry angle
@@ -128,8 +115,6 @@ class ObservationModelWithEffects(ObservationModel):
             load_slope=slope,
             load_residual=off,
             by_effects=held(by_effects),
-            extra_pull=np.asarray(value_of(pull)),
-            extra_pull_by_effects=pull_by_effects,
         )
 
     def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
@@ -148,31 +133,26 @@ class ObservationModelWithEffects(ObservationModel):
                 excess = excess + effect.load(wheels.surroundings, values)
         return excess
 
-    def _extra_pull(self, pull: Dual, active: Sequence[Active], surroundings: Surroundings) -> Any:
-        """Pull [N] (N,) asked of the wheels beyond the measured demand; pull (N, W) [N] is the wheels' own."""
-        # Draft and acceleration are those estimated from the whole balance: a measurement's own noise, beside an error
-        # proportional to it, would make a larger draft and a smaller mass fit better (errors in variables).
-
-        def resistance(surroundings: Surroundings) -> Any:
-            parts = [
-                effect.resistance(surroundings, values) for effect, values in active if effect.resistance is not None
-            ]
-            return sum(parts, np.zeros(self.n))
-
-        draft = true_draft(active, self.draft, surroundings)
-        off = self.inertia + draft + resistance(surroundings) - pull.sum(axis=1)
-        # shares of draft [1] and acceleration [1/kg] in a residual of 1 N of the balance, by their noise
-        mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
-        by_draft, by_acceleration = (
-            np.divide(variance, self.demand_var, out=np.zeros(self.n), where=self.draft_var > 0.0)
-            for variance in (self.draft_var, mass * self.acceleration_var)
-        )
-        estimated = surroundings._replace(acceleration=surroundings.acceleration - (by_acceleration * off)[:, None])
-        errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
-        if errors:
-            true = draft - by_draft * off
-            draft = self.draft - sum(error(true, estimated, values) for error, values in errors)
-        return resistance(estimated) + draft - self.draft
+    def extra_pull(self, gains: Array, latents: Latents, noise: Array | None = None) -> tuple[Array, Array]:
+        """As `ObservationModel.extra_pull`."""
+        if not self.effects:
+            return super().extra_pull(gains, latents)
+        active = active_with_derivatives(self.effects, self.free, gains[self.layout.effects], self.n_wheels)
+        around, reading = self._surroundings(latents), self.draft
+        if noise is not None:
+            mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
+            quiet = around.acceleration - (mass * self.acceleration_var * noise)[:, None]
+            around, reading = around._replace(acceleration=quiet), reading - self.draft_var * noise
+        draft, pull = true_draft(active, reading, around), np.zeros(self.n)
+        for effect, values in active:
+            if effect.resistance is not None:
+                pull = pull + effect.resistance(around, values)
+            if effect.draft is not None:
+                pull = pull - effect.draft(draft, around, values)
+        by_effects = np.zeros((len(self.free), self.n))
+        for i in range(len(self.free)):
+            by_effects[i] = slope_of(pull, i)
+        return np.asarray(value_of(pull)), by_effects
 
     def _surroundings(self, latents: Latents) -> Surroundings:
         chassis = self.rig.chassis

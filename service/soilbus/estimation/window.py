@@ -46,6 +46,8 @@ VEHICLE_QUANTITIES = (
     "ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "roll", "steering_angle", "differential_lock",
 )  # fmt: skip
 """Quantities that the vehicle has one channel of."""
+ALONG = ("torque", "speed", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
+"""Quantities that change their sign where the vehicle reverses."""
 LEAST_LEVEL = {
     "torque": 50.0, "load": 500.0, "speed": 0.4, "sinkage": 0.01,
     "ground_speed": 0.2, "draft": 500.0, "pitch": 0.01, "acceleration": 0.1, "yaw_rate": 0.02,
@@ -192,6 +194,7 @@ def forward(window: Window) -> Window:
     direction = np.where(majority < 0.0, -1.0, 1.0)
     undecided = (majority == 0.0) & (np.abs(turns) > 0.0).any(axis=1)
     speed = direction[:, None] * window.speed
+    curves = {name: _ahead(name.partition(".")[0], curve, window.t, direction) for name, curve in window.curves.items()}
     return replace(
         window,
         speed=np.where((speed < 0.0) | undecided[:, None], np.nan, speed),
@@ -202,8 +205,16 @@ def forward(window: Window) -> Window:
         acceleration=direction * window.acceleration,
         yaw_rate=direction * window.yaw_rate,
         direction=direction,
-        curves={},
+        curves=curves,
     )
+
+
+def _ahead(quantity: str, curve: Curve, t: Array, direction: Array) -> Curve:
+    """Return the curve of a quantity in the same drive forward; direction (N,) at times t (N,) [s] as in Window."""
+    if quantity not in ALONG:
+        return curve
+    way = np.where(np.interp(curve.t, t, direction) < 0.0, -1.0, 1.0)
+    return curve.times(np.where(way < 0.0, np.sign(curve.value), 1.0) if quantity == "ground_speed" else way)
 
 
 def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
