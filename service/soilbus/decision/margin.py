@@ -144,9 +144,8 @@ def _time_to_weaken(x: Array, capacity: Array, reserve: Array, peak: float, opti
     if len(changes[-1]) < 4:
         return math.inf
     like = lag * (len(x) - 1) / (x[-1] - x[0])  # rows with the same scatter
-    scatter = max(
-        float(change @ change) / len(change) / 2.0 for change in changes
-    )  # a bounce has the period of the lag
+    # over half the lag too: a bounce at 2 Hz does not show in changes over 0.5 s
+    scatter = max(float(change @ change) / len(change) / 2.0 for change in changes)
     variance = max(scatter, 1.0) * like
     columns = np.stack([np.ones_like(x), x, reserve, moves])
     prior = np.diag([0.0, 0.0, options.form_error**-2, options.lateness**-2])
