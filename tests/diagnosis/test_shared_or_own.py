@@ -26,6 +26,10 @@ BLIND = CONFIG.model_copy(update={"signals": CONFIG.signals.model_copy(update={"
 """The same tractor without a pitch sensor."""
 PITCH_OF_OFFSET = 400.0 / (CONFIG.vehicle.mass * GRAVITY)
 """Slope [rad] that holds back as much as an offset of 400 N."""
+RIVALS = [
+    CATALOGUE[name] for name in ("draft_offset", "grade", "draft_gain", "bulldozing", "drivetrain_loss", "inertia")
+]
+"""What pushes or seems to push."""
 
 
 def field(config: Config, soil: str, slope: float, seed: int, *effects: str) -> Record:
@@ -37,7 +41,7 @@ def field(config: Config, soil: str, slope: float, seed: int, *effects: str) -> 
 def diagnosed(config: Config, seed: int, slopes: tuple[float, ...], *effects: str) -> Diagnosis:
     drives = enumerate(zip(SOILS, slopes, strict=True))
     records = [field(config, soil, slope, 10 * seed + i, *effects) for i, (soil, slope) in drives]
-    return diagnose(records, prior_of(config), list(CATALOGUE.values()))
+    return diagnose(records, prior_of(config), RIVALS)
 
 
 def chances(found: Diagnosis) -> dict[str, float]:
@@ -79,22 +83,17 @@ def test_slopes_that_differ_from_field_to_field_are_no_offset():
 )
 def test_one_field_does_not_separate_a_slope_from_an_offset():
     records = [field(BLIND, "loam", 0.0, 5, "draft_offset=400")]
-    found = diagnose(records, prior_of(BLIND), list(CATALOGUE.values()))
+    found = diagnose(records, prior_of(BLIND), RIVALS)
     assert min(chances(found)[name] for name in ("draft_offset", "grade")) > 0.1
 
 
-@pytest.mark.parametrize(
-    ("seed", "degrees"),
-    [pytest.param(7, 0.5, marks=pytest.mark.xfail(strict=True, reason="not seen in means over 0.25 s")), (8, 2.0)],
-)
-def test_a_pitch_offset_is_one_of_the_vehicle(seed, degrees):
-    """A pitch sensor that is off by 0.5 deg leaves the same push in every recording, and is never given more than 1."""
-    records = [
-        with_pitch_error(field(CONFIG, soil, 0.0, 10 * seed + i), np.radians(degrees)) for i, soil in enumerate(SOILS)
-    ]
+@pytest.mark.xfail(strict=True, reason="half a degree of pitch is not seen in means over a quarter of a second")
+def test_a_pitch_offset_is_one_of_the_vehicle():
+    """A pitch sensor that is off by 0.5 deg leaves the same push in every recording."""
+    error = np.radians(0.5)
+    records = [with_pitch_error(field(CONFIG, soil, 0.0, 70 + i), error) for i, soil in enumerate(SOILS)]
     offset = diagnose(records, prior_of(CONFIG), [CATALOGUE["grade"]]).completed.parameters()["grade"]["pitch_offset"]
-    assert abs(offset.value) <= 0.015
-    assert degrees > 0.5 or abs(offset.value - np.radians(0.5)) < 4.0 * offset.std < 0.005
+    assert abs(offset.value - error) < 4.0 * offset.std < 0.005
 
 
 def with_pitch_error(record: Record, error: float) -> Record:

@@ -106,9 +106,9 @@ def start_after_stop(config: Config, rate: float, top: float, seed: int, lasts: 
     return told(continued(done, config, waits + lasts, starting), config, seed, float(done.columns["t"][-1]) + waits)
 
 
-def halted_by_a_patch(config: Config, seed: int, deceleration: float = 1.0, lasts: float = 8.0) -> Story:
+def halted_by_a_patch(config: Config, seed: int, drives: float = 14.0, lasts: float = 5.0) -> Story:
     """Left wheels meet a soft patch and spin through open differentials until the vehicle stands, and go on."""
-    done = driven(config, seed, 14.0, None)
+    done, deceleration = driven(config, seed, drives, None), 1.0
     speed = float(done.columns["ground_speed"][-1])
 
     def halting(t: np.ndarray) -> dict[str, np.ndarray]:
