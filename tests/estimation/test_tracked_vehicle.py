@@ -34,7 +34,7 @@ CRAWLER = Path(__file__).parents[1] / "field" / "tracked.toml"
 WITH_CELLS = (
     "track.L.load=WheelLoads.FL", "track.R.load=WheelLoads.FR", "noise.load.relative=0.01", "noise.load.gain=0.005",
 )  # fmt: skip
-WEIGHT, R, B, L, MOST = 4500.0 * 9.80665, 0.30, 0.35, 1.6, 8000.0
+WEIGHT, R, B, L = 4500.0 * 9.80665, 0.30, 0.35, 1.6
 LOAM = SOILS["loam"]
 NO_LIMIT = np.full(2, np.nan)
 
