@@ -11,7 +11,7 @@ from soilbus.estimation.posterior import NORMAL_95, PARAMETERS
 from soilbus.simulator.reference import reference_configuration
 
 SOILS = ("loam", "wet_clay", "dry_sand")
-WINDOWS = {2.0: 23, 20.0: 5}
+WINDOWS = {2.0: 20, 20.0: 8}
 """Of each length and soil; with and without sinkage sensors from the same drives."""
 WINDOWS_OF_ANY_K_C = {10.0: 5}
 QUANTITIES = (*PARAMETERS, "bearing_pressure")
