@@ -20,6 +20,7 @@ from soilbus.offline.replay import replay
 from soilbus.pipeline.outputs import flat_record, json_line
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.report.batch import batch_text, fleet_text
+from soilbus.terra.effects.catalogue import CATALOGUE
 
 pd = pytest.importorskip("pandas")
 SHORT = "estimator.window=4"
@@ -220,6 +221,13 @@ def die(job: object, *_: object) -> None:
     raise KilledWorker(job)
 
 
+@pytest.fixture
+def one_candidate(monkeypatch):
+    """Diagnoses try one effect alone."""
+    monkeypatch.setattr("soilbus.offline.fleet.possible_effects", lambda config: [CATALOGUE["grade"]])
+
+
+@pytest.mark.usefixtures("one_candidate")
 def test_a_vehicle_whose_diagnosis_failed_is_diagnosed_again_on_request(client, config, logs, tmp_path, monkeypatch):
     own = jobs_of(config, "t", [str(logs / "red")], no_other)
     with monkeypatch.context() as patch:
@@ -231,6 +239,7 @@ def test_a_vehicle_whose_diagnosis_failed_is_diagnosed_again_on_request(client, 
     assert ["1 of 1 vehicles diagnosed" in lines for lines in said.values()] == [False, True]
 
 
+@pytest.mark.usefixtures("one_candidate")
 def test_a_diagnosis_of_an_earlier_run_does_not_stay_beside_other_logs(client, config, logs, moved, tmp_path):
     (tmp_path / "logs/red").mkdir(parents=True)
     (tmp_path / "logs/red/a.log").write_text(moved(0.0))

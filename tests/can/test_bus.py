@@ -36,6 +36,15 @@ def live(opener, clock) -> LiveBus:
     return LiveBus(opener, clock, clock.sleep)
 
 
+def opened(messages=(), own=()) -> tuple[LiveBus, ScriptedBus, FakeClock]:
+    """A bus that is open and hears these messages, its wire and the clock."""
+    clock = FakeClock()
+    wire = ScriptedBus(clock, messages)
+    bus = LiveBus(lambda: wire, clock, clock.sleep, own)
+    bus.open()
+    return bus, wire, clock
+
+
 def test_an_unknown_interface_is_one_line_and_will_not_come():
     with pytest.raises(BusError) as caught:
         open_bus({"interface": "nosuch", "channel": "x"})
@@ -106,10 +115,7 @@ def test_a_bus_that_stays_away_is_tried_with_back_off_and_never_blocks():
 
 
 def test_error_frames_are_counted_not_handed_on():
-    clock = FakeClock()
-    wire = ScriptedBus(clock, [can.Message(timestamp=1.7e9, is_error_frame=True), can.Message(timestamp=1.7e9)])
-    bus = live(lambda: wire, clock)
-    bus.open()
+    bus, _, _ = opened([can.Message(timestamp=1.7e9, is_error_frame=True), can.Message(timestamp=1.7e9)])
     assert bus.receive(1.0) is None
     assert bus.receive(1.0) is not None
     assert bus.counts.error_frames == 1
@@ -117,11 +123,8 @@ def test_error_frames_are_counted_not_handed_on():
 
 @pytest.mark.parametrize("number", [errno.ENETDOWN, errno.ENODEV, errno.EIO])
 def test_a_send_that_finds_the_bus_gone_closes_it(number):
-    clock = FakeClock()
-    wire = ScriptedBus(clock)
+    bus, wire, clock = opened()
     wire.fail_send.append(can.CanOperationError("gone", number))
-    bus = live(lambda: wire, clock)
-    bus.open()
     assert not bus.send(FRAME)
     assert not bus.is_open
     assert wire.closed
@@ -132,11 +135,8 @@ def test_a_send_that_finds_the_bus_gone_closes_it(number):
 
 
 def test_a_full_queue_keeps_the_bus_open():
-    clock = FakeClock()
-    wire = ScriptedBus(clock)
+    bus, wire, _ = opened()
     wire.fail_send.append(can.CanOperationError("full", errno.ENOBUFS))
-    bus = live(lambda: wire, clock)
-    bus.open()
     assert not bus.send(FRAME)
     assert bus.is_open
     assert bus.send(FRAME)
@@ -144,11 +144,8 @@ def test_a_full_queue_keeps_the_bus_open():
 
 
 def test_a_frame_that_waits_goes_out_with_the_next_look_and_never_blocks():
-    clock = FakeClock()
-    wire = ScriptedBus(clock)
+    bus, wire, clock = opened()
     wire.full_until = clock.now + 0.03
-    bus = live(lambda: wire, clock)
-    bus.open()
     assert not bus.send(FRAME)
     while not wire.sent:
         before = clock.now
@@ -159,11 +156,8 @@ def test_a_frame_that_waits_goes_out_with_the_next_look_and_never_blocks():
 
 
 def test_nothing_that_waited_is_sent_when_the_bus_comes_back():
-    clock = FakeClock()
-    wire = ScriptedBus(clock)
+    bus, wire, clock = opened()
     wire.full_until = clock.now + 0.05
-    bus = live(lambda: wire, clock)
-    bus.open()
     bus.send(FRAME)
     wire.fail_receive.append(OSError(errno.ENODEV, "No such device"))
     bus.receive(0.0)
@@ -205,10 +199,7 @@ OWN = (0x18FF649A, True)
     ],
 )
 def test_our_own_identifiers_are_never_handed_on(message, foreign):
-    clock = FakeClock()
-    bus = LiveBus(lambda: wire, clock, clock.sleep, own=[OWN])
-    wire = ScriptedBus(clock, [message, can.Message(timestamp=1.7e9, arbitration_id=0x64A)])
-    bus.open()
+    bus, _, clock = opened([message, can.Message(timestamp=1.7e9, arbitration_id=0x64A)], [OWN])
     assert bus.receive(0.1) is None
     assert bus.receive(0.1) is not None
     assert (bus.counts.foreign, bus.counts.received) == (foreign, 1)
@@ -216,12 +207,8 @@ def test_our_own_identifiers_are_never_handed_on(message, foreign):
 
 
 def test_faults_that_last_are_said_once_in_a_while(caplog):
-    clock = FakeClock()
-    stranger = can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8))
-    wire = ScriptedBus(clock, [stranger] * 1000)
+    bus, wire, clock = opened([can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8))] * 1000, [OWN])
     wire.full_until = clock.now + 1e9
-    bus = LiveBus(lambda: wire, clock, clock.sleep, own=[OWN])
-    bus.open()
     for _ in range(1000):
         bus.receive(0.0)
         bus.send(FRAME)
@@ -235,11 +222,8 @@ def test_faults_that_last_are_said_once_in_a_while(caplog):
 
 @pytest.mark.parametrize("error", [ValueError("invalid literal for int()"), IndexError("string index out of range")])
 def test_a_frame_that_the_driver_cannot_read_is_counted_and_the_next_one_comes(error):
-    clock = FakeClock()
-    wire = ScriptedBus(clock, [can.Message(timestamp=1.7e9)])
+    bus, wire, _ = opened([can.Message(timestamp=1.7e9)])
     wire.fail_receive.append(error)
-    bus = live(lambda: wire, clock)
-    bus.open()
     assert bus.receive(1.0) is None
     assert not bus.found_nothing  # other frames may wait behind it
     assert bus.receive(1.0) is not None
@@ -249,28 +233,25 @@ def test_a_frame_that_the_driver_cannot_read_is_counted_and_the_next_one_comes(e
 
 def test_a_driver_that_only_garbles_is_opened_anew():
     clock = FakeClock()
-    opened = []
+    times = []
 
     class Garbling(ScriptedBus):
         def recv(self, timeout=None):
             clock.now += 0.01
             raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
 
-    bus = live(lambda: opened.append(clock.now) or Garbling(clock), clock)
+    bus = live(lambda: times.append(clock.now) or Garbling(clock), clock)
     bus.open()
     begin = clock.now
     while clock.now < begin + 20.0:
         bus.receive(0.02)
-    assert 8 <= len(opened) <= 20
+    assert 8 <= len(times) <= 20
     assert bus.counts.garbled > 500
 
 
 def test_only_silence_counts_as_nothing_to_take():
-    clock = FakeClock()
     theirs = can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8))
-    wire = ScriptedBus(clock, [theirs, can.Message(timestamp=1.7e9, is_error_frame=True)])
-    bus = LiveBus(lambda: wire, clock, clock.sleep, [OWN])
-    bus.open()
+    bus, _, _ = opened([theirs, can.Message(timestamp=1.7e9, is_error_frame=True)], [OWN])
     found_nothing = []
     for _ in range(3):
         assert bus.receive(0.1) is None
@@ -285,11 +266,8 @@ def numbered(identifier: int, content: int = 0) -> Frame:
 
 def full() -> tuple[LiveBus, ScriptedBus, FakeClock]:
     """A bus without room, its wire and the clock."""
-    clock = FakeClock()
-    wire = ScriptedBus(clock)
+    bus, wire, clock = opened()
     wire.full_until = math.inf
-    bus = live(lambda: wire, clock)
-    bus.open()
     return bus, wire, clock
 
 

@@ -35,9 +35,12 @@ from soilbus.simulator.sensors import measure
 CONFIG = reference_configuration()
 NOT_STRICT = ["estimator.max_bearing_std=1.0", "estimator.max_draft_std=1.0"]
 """Short drives of machines without load cells say little of pressure and draft, and a go is to end here."""
+SHORT = ["estimator.window=5"]
 MACHINES = {
-    name: reference_configuration([] if name == "tractor" else NOT_STRICT, path) for name, path in REFERENCES.items()
+    name: reference_configuration(SHORT if name == "tractor" else NOT_STRICT, path) for name, path in REFERENCES.items()
 }
+DRIVES = dict.fromkeys(MACHINES, 13.0) | {"tractor": 8.0}
+"""Seconds for which a machine drives before anything happens: its windows, and two to say go."""
 
 
 def replayed(messages: Iterable[can.Message], config=CONFIG, database=None) -> list[WindowResult]:
@@ -94,14 +97,14 @@ def judge(story: Story, sent) -> None:
 )  # fmt: skip
 def test_a_start_in_vain_ends_go_on_the_bus(machine, attempt):
     config = MACHINES[machine]
-    story = stop_and_try(config, TRIES[attempt], seed=list(TRIES).index(attempt))
+    story = stop_and_try(config, TRIES[attempt], list(TRIES).index(attempt), DRIVES[machine], lasts=5.0)
     judge(story, live(story.messages, config))
 
 
 @pytest.mark.parametrize("machine", ["tractor", "tractor-axles"])
 def test_a_soft_patch_under_one_side_ends_go_on_the_bus(machine):
     config = MACHINES[machine]
-    story = halted_by_a_patch(config, 11)
+    story = halted_by_a_patch(config, 11, DRIVES[machine] + 1.0)
     sent = live(story.messages, config)
     assert "go" in {state for at, state in states(sent) if at < story.begins - 2.0}
     for at, state in states(sent):
@@ -115,7 +118,7 @@ def test_a_soft_patch_under_one_side_ends_go_on_the_bus(machine):
 )
 def test_a_replay_says_what_the_service_says(machine, attempt):
     config = MACHINES[machine]
-    story = stop_and_try(config, TRIES[attempt], seed=21)
+    story = stop_and_try(config, TRIES[attempt], 21, DRIVES[machine])
     results = replayed(story.messages, config)
     assert State.GO in {r.traversability.state for r in results if r.t < story.begins}
     after = [r for r in results if r.t > story.begins + 1.0]

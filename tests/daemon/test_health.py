@@ -13,7 +13,7 @@ import can
 import pytest
 
 from fakes import Bench, FakeClock, HeldExecutor, drive_messages
-from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.dbc_files import load_databases
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
@@ -21,7 +21,6 @@ from soilbus.simulator.reference import reference_configuration
 WINDOW = 8.0
 CONFIG = reference_configuration([f"estimator.window={WINDOW}"])
 DATABASE = load_databases(CONFIG)
-OUT = output_database(CONFIG)
 WATCHDOG = 10.0
 HARD_WINDOW = 18.0
 """Seconds that a window may take: a slow machine's hardest take a few."""

@@ -21,21 +21,34 @@ from soilbus.daemon.notify import Notifier
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.simulator.reference import reference_configuration
 
-DURATION = 16.0
+CONFIG = reference_configuration(["estimator.window=4"])
+DURATION = 10.0
 STAMPED = 0.001
 """Seconds that the scripted kernel needs from a frame's stamp to the socket."""
 
 
 @pytest.fixture(scope="module")
 def recording() -> list[can.Message]:
-    return drive_messages(reference_configuration(), DURATION)
+    return drive_messages(CONFIG, DURATION)
 
 
 @pytest.fixture(scope="module")
 def good(recording) -> Bench:
     """The service after a good drive."""
-    bench = Bench(recording)
+    bench = Bench(recording, CONFIG)
     bench.run(DURATION)
+    return bench
+
+
+SILENT = 6.0
+"""Seconds for which nothing is heard after the drive."""
+
+
+@pytest.fixture(scope="module")
+def silent(recording) -> Bench:
+    """The service after a good drive and the silence that follows."""
+    bench = Bench(recording, CONFIG)
+    bench.run(DURATION + SILENT)
     return bench
 
 
@@ -60,7 +73,7 @@ def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves
 def test_a_window_that_the_bus_can_end_waits_for_no_frame_and_says_the_same(recording, monkeypatch):
     """Frames of the kernel are stamped by a clock that can be asked; here it is the scripted bus's."""
     sparse = [message for message in recording if message.timestamp % 0.1 < 0.05]
-    benches = [Bench(sparse), Bench(sparse)]
+    benches = [Bench(sparse, CONFIG), Bench(sparse, CONFIG)]
     benches[0].run(DURATION - 0.5)
     told = benches[1].wire
 
@@ -141,18 +154,16 @@ def test_advice_limits_and_forecast_are_those_of_the_result(good):
         assert frame["Sinkage"] == pytest.approx(1e3 * forecast.deepest.value, abs=0.251)
 
 
-def test_present_draft_is_that_of_the_vehicles_own_frames_and_blank_without_them(recording):
-    bench = Bench(recording)
-    bench.run(DURATION + 2.0)
-    of_hitch = load_databases(bench.config).get_message_by_name("DrawbarPin")
+def test_present_draft_is_that_of_the_vehicles_own_frames_and_blank_without_them(recording, silent):
+    of_hitch = load_databases(silent.config).get_message_by_name("DrawbarPin")
     drafts = [
         (m.timestamp, of_hitch.decode(bytes(m.data))["Draft"])
         for m in recording
         if m.arbitration_id == of_hitch.frame_id
     ]
-    sent = [(f["at"] + bench.wire.offset, f["Draft"], f["Slope"]) for f in bench.sent("PresentDemand")]
+    sent = [(f["at"] + silent.wire.offset, f["Draft"], f["Slope"]) for f in silent.sent("PresentDemand")]
     compared = [f for f in sent if recording[0].timestamp + 2.0 < f[0] < recording[-1].timestamp - 0.2]
-    assert len(compared) > 100
+    assert len(compared) > 70
     for at, draft, slope in compared[::10]:
         of_last = [value for t, value in drafts if at - 0.4 < t < at]
         assert min(of_last) <= draft <= max(of_last)
@@ -161,33 +172,31 @@ def test_present_draft_is_that_of_the_vehicles_own_frames_and_blank_without_them
 
 
 def test_quality_of_a_window_names_refusals_and_chi_square_of_each_channel(recording):
-    of_hitch = load_databases(reference_configuration()).get_message_by_name("DrawbarPin")
+    of_hitch = load_databases(CONFIG).get_message_by_name("DrawbarPin")
     broken = [copy(message) for message in recording]
     bad = [m for m in broken if m.arbitration_id == of_hitch.frame_id][::50]
     for message in bad:
         message.data = bytes((*message.data[:7], message.data[7] ^ 1))
-    bench = Bench(broken)
+    bench = Bench(broken, CONFIG)
     bench.run(DURATION)
     for result, frame in zip(bench.results, bench.sent("WindowQuality"), strict=True):
         assert frame["Window"] == result.index % 251
         assert str(frame["RejectedReason"]) == "bad_checksum"
-        assert frame["Rejected"] == sum(result.rejected.values()) >= len(bad) / 2
+        assert frame["Rejected"] == sum(result.rejected.values()) >= len(bad) / 3
         assert set(result.channel_chi2) == {"torque", "draft", "sinkage"}
         for channel, chi2 in result.channel_chi2.items():
             assert frame[f"Chi2{channel.capitalize()}"] == pytest.approx(chi2, abs=0.026)
 
 
-def test_the_warning_is_unknown_until_slip_is_known_and_when_the_bus_falls_silent(recording):
-    bench = Bench(recording)
-    bench.run(DURATION + 4.0)
-    frames = bench.sent("DemandForecast")
-    first = bench.sent("SoilStrength")[0]["at"]
-    silent = bench.clock.now - 4.0
+def test_the_warning_is_unknown_until_slip_is_known_and_when_the_bus_falls_silent(silent):
+    frames = silent.sent("DemandForecast")
+    first = silent.sent("SoilStrength")[0]["at"]
+    ends = silent.clock.now - SILENT
     assert {str(f["Warning"]) for f in frames if frames[0]["at"] + 1.0 < f["at"] < first + 1.8} == {"none"}
-    during = [f for f in frames if first + 2.5 < f["at"] < silent]
+    during = [f for f in frames if first + 2.5 < f["at"] < ends]
     assert {str(f["Warning"]) for f in during} <= {"none", "immobilisation"}
     assert all(0.0 <= f["TimeLeft"] <= 25.0 for f in during)
-    for frame in (f for f in frames if f["at"] > silent + 2.5):
+    for frame in (f for f in frames if f["at"] > ends + 2.5):
         assert str(frame["Warning"]) == "unknown"
         assert {str(frame[k]) for k in ("Slip", "SlipStd", "Sinkage", "TimeLeft", "Window", "Status")} == {
             "not_available"
@@ -196,30 +205,29 @@ def test_the_warning_is_unknown_until_slip_is_known_and_when_the_bus_falls_silen
 
 @pytest.mark.parametrize("lost", ["GroundBasedSpeedAndDistance", "MotorRL"])
 def test_losing_a_needed_stream_ends_go_within_its_timeout(recording, lost):
-    config = reference_configuration()
-    database = load_databases(config)
+    database = load_databases(CONFIG)
     names = {m.name for m in database.messages}
     full = next(n for n in names if n.startswith(lost))
     frame_id = database.get_message_by_name(full).frame_id
-    cut = recording[0].timestamp + 13.0
+    cut = recording[0].timestamp + 7.0
     kept = [m for m in recording if m.arbitration_id != frame_id or m.timestamp < cut]
-    bench = Bench(kept)
+    bench = Bench(kept, CONFIG)
     bench.run(DURATION)
     start = bench.clock.now - DURATION
-    late = [f for f in bench.sent("Traversability") if f["at"] > start + 13.0 + 1.0 + 0.25]
+    late = [f for f in bench.sent("Traversability") if f["at"] > start + 7.0 + 1.0 + 0.25]
     assert late
     assert {str(f["State"]) for f in late} == {"unknown"}
     assert str(bench.sent("SoilbusStatus")[-1]["State"]) == "degraded"
 
 
 def test_the_journal_says_once_a_minute_which_input_fails(recording, caplog):
-    load = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    load = load_databases(CONFIG).get_message_by_name("WheelLoads").frame_id
     start = recording[0].timestamp
 
-    def is_lost(t: float) -> bool:  # for 4 s, and again a while later
-        return 5.0 <= t - start < 9.0 or 12.0 <= t - start < 15.0
+    def is_lost(t: float) -> bool:  # for 3 s, and again a while later
+        return 2.0 <= t - start < 5.0 or 7.0 <= t - start < 9.5
 
-    bench = Bench([m for m in recording if m.arbitration_id != load or not is_lost(m.timestamp)])
+    bench = Bench([m for m in recording if m.arbitration_id != load or not is_lost(m.timestamp)], CONFIG)
     bench.run(DURATION)
     said = [record.getMessage() for record in caplog.records]
     assert [text for text in said if "input" in text] == [
@@ -234,19 +242,17 @@ def test_a_bus_on_which_nothing_was_heard_yet_is_no_failure(caplog):
     assert not caplog.records
 
 
-def test_silence_ends_go_and_is_no_reason_to_stop(recording):
-    bench = Bench(recording)
-    bench.run(DURATION + 6.0)
-    last = bench.sent("Traversability", since=bench.clock.now - 3.0)
+def test_silence_ends_go_and_is_no_reason_to_stop(silent):
+    last = silent.sent("Traversability", since=silent.clock.now - 3.0)
     assert {str(f["State"]) for f in last} == {"unknown"}
-    status = bench.sent("SoilbusStatus")[-1]
+    status = silent.sent("SoilbusStatus")[-1]
     assert (str(status["State"]), str(status["Reason"])) == ("listening", "no_frames")
-    assert {str(f["SlipWheel1"]) for f in bench.sent("WheelSlip", since=bench.clock.now - 3.0)} == {"not_available"}
+    assert {str(f["SlipWheel1"]) for f in silent.sent("WheelSlip", since=silent.clock.now - 3.0)} == {"not_available"}
 
 
 def test_an_outage_between_two_beats_ends_go_too(recording):
-    bench = Bench(recording)
-    bench.run(13.5)
+    bench = Bench(recording, CONFIG)
+    bench.run(7.5)
     assert str(bench.sent("Traversability")[-1]["State"]) == "go"
     gone = bench.clock.now
     bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
@@ -263,9 +269,9 @@ def test_an_outage_between_two_beats_ends_go_too(recording):
 
 
 def test_a_window_that_ends_after_an_outage_but_whose_data_end_before_it_is_no_decision(recording):
-    """The bus is back in time for the window's end at 14 s, and nothing was heard for 0.7 s."""
-    begin, gone = recording[0].timestamp, 13.3
-    bench = Bench([m for m in recording if not begin + gone <= m.timestamp < begin + gone + 0.7])
+    """The bus is back in time for the window's window's end at 8 s, and nothing was heard for 0.7 s."""
+    begin, gone = recording[0].timestamp, 7.3
+    bench = Bench([m for m in recording if not begin + gone <= m.timestamp < begin + gone + 0.7], CONFIG)
     bench.run(gone)
     bench.away = True
     bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
@@ -283,23 +289,23 @@ def error_frame(t: float, error_class: int, *data: int) -> can.Message:
 
 def test_bus_off_ends_go_until_the_controller_is_back(recording):
     begin = recording[0].timestamp
-    off, back = error_frame(begin + 13.0, 0x040), error_frame(begin + 14.5, 0x100)
-    passed = [m for m in recording if not begin + 13.0 <= m.timestamp < begin + 14.5]
-    bench = Bench(sorted([*passed, off, back], key=lambda m: m.timestamp))
+    off, back = error_frame(begin + 7.0, 0x040), error_frame(begin + 8.5, 0x100)
+    passed = [m for m in recording if not begin + 7.0 <= m.timestamp < begin + 8.5]
+    bench = Bench(sorted([*passed, off, back], key=lambda m: m.timestamp), CONFIG)
     start = bench.clock.now
     bench.run(DURATION)
-    during = bench.sent("SoilbusStatus", since=start + 13.05)[0]
+    during = bench.sent("SoilbusStatus", since=start + 7.05)[0]
     assert (str(during["State"]), str(during["Reason"])) == ("waiting", "bus_error")
-    assert {str(f["State"]) for f in bench.sent("Traversability", since=start + 13.1)[:14]} == {"unknown"}
-    assert str(bench.sent("BusHealth", since=start + 13.05)[0]["BusState"]) == "bus_off"
+    assert {str(f["State"]) for f in bench.sent("Traversability", since=start + 7.1)[:14]} == {"unknown"}
+    assert str(bench.sent("BusHealth", since=start + 7.05)[0]["BusState"]) == "bus_off"
     last = bench.sent("BusHealth")[-1]
     assert (str(last["BusState"]), last["ErrorFrames"]) == ("error_active", 2)
     assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) not in ("bus_error", "bus_down")
 
 
 def test_an_error_passive_controller_is_told_of_beside_a_valid_state(recording):
-    passive = error_frame(recording[0].timestamp + 12.5, 0x004, 0, 0x20)
-    bench = Bench(sorted([*recording, passive], key=lambda m: m.timestamp))
+    passive = error_frame(recording[0].timestamp + 6.5, 0x004, 0, 0x20)
+    bench = Bench(sorted([*recording, passive], key=lambda m: m.timestamp), CONFIG)
     bench.run(DURATION)
     status = bench.sent("SoilbusStatus")[-1]
     assert (str(status["State"]), str(status["Reason"])) == ("valid", "bus_error")
@@ -308,12 +314,12 @@ def test_an_error_passive_controller_is_told_of_beside_a_valid_state(recording):
 
 def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(recording):
     begin = recording[0].timestamp
-    ours = Publisher(output_database(reference_configuration()))
+    ours = Publisher(output_database(CONFIG))
     forged = []
     for i in range(5):
         frame, at = ours.frame("Traversability", {"State": "go"}), begin + 2.0 + 0.1 * i
         forged.append(can.Message(timestamp=at, arbitration_id=frame.arbitration_id, data=frame.data))
-    bench = Bench(sorted([*recording, *forged], key=lambda m: m.timestamp))
+    bench = Bench(sorted([*recording, *forged], key=lambda m: m.timestamp), CONFIG)
     start = bench.clock.now
     bench.run(DURATION)
     health = bench.sent("BusHealth")[-1]
@@ -328,24 +334,25 @@ def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(rec
 
 
 def test_a_second_sender_ends_go(recording):
-    forged = can.Message(timestamp=recording[0].timestamp + 13.0, arbitration_id=0x18FF649A, data=bytes(8))
-    bench = Bench(sorted([*recording, forged], key=lambda m: m.timestamp))
+    forged = can.Message(timestamp=recording[0].timestamp + 7.0, arbitration_id=0x18FF649A, data=bytes(8))
+    bench = Bench(sorted([*recording, forged], key=lambda m: m.timestamp), CONFIG)
     start = bench.clock.now
     bench.run(DURATION)
     verdicts = bench.sent("Traversability")
-    assert str(next(f for f in reversed(verdicts) if f["at"] < start + 12.9)["State"]) == "go"
-    assert {str(f["State"]) for f in verdicts if f["at"] > start + 13.05} == {"unknown"}
+    assert str(next(f for f in reversed(verdicts) if f["at"] < start + 6.9)["State"]) == "go"
+    assert {str(f["State"]) for f in verdicts if f["at"] > start + 7.05} == {"unknown"}
     assert {str(r.status) for r in bench.results} == {"valid"}
     for name in ("SoilStrength", "DraftCapability", "TractionLimits", "SoilClass"):  # nor is anything else vouched for
         status = [(f["at"] - start, str(f["Status"])) for f in bench.sent(name)]
-        assert {s for t, s in status if t < 13.0} == {"valid"}
-        assert {s for t, s in status if t > 13.05} == {"degraded"}
+        assert {s for t, s in status if t < 7.0} == {"valid"}
+        assert {s for t, s in status if t > 7.05} == {"degraded"}
         assert len(status) == len(bench.results)
 
 
 def test_stop_says_unknown_last(recording):
-    bench = Bench(recording)
-    bench.run(DURATION)
+    bench = Bench(recording, CONFIG)
+    bench.run(7.0)
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
     bench.service.stop()
     bench.service.run()
     assert str(bench.sent("Traversability")[-1]["State"]) == "unknown"
@@ -353,10 +360,10 @@ def test_stop_says_unknown_last(recording):
 
 
 def test_the_output_dbc_decides_the_identifiers(recording, tmp_path):
-    text = output_database(reference_configuration()).as_dbc_string()
+    text = output_database(CONFIG).as_dbc_string()
     moved = text.replace(str(0x80000000 | 0x18FF629A), str(0x80000000 | 0x18FF909A))
     (tmp_path / "moved.dbc").write_text(moved)
-    ours = output_database(reference_configuration()).get_message_by_name("WheelSlip").frame_id
+    ours = output_database(CONFIG).get_message_by_name("WheelSlip").frame_id
     assert ours == 0x18FF629A
     config = reference_configuration([f'output.dbc="{tmp_path / "moved.dbc"}"'])
     bench = Bench(recording, config)
@@ -367,16 +374,16 @@ def test_the_output_dbc_decides_the_identifiers(recording, tmp_path):
 
 def test_a_window_that_ended_before_the_bus_came_back_says_nothing_of_the_present(recording):
     begin = recording[0].timestamp
-    bench = Bench([m for m in recording if not 12.9 <= m.timestamp - begin < 13.25])
+    bench = Bench([m for m in recording if not 6.9 <= m.timestamp - begin < 7.25], CONFIG)
     start = bench.clock.now
-    bench.run(12.85)
+    bench.run(6.85)
     gone = bench.clock.now
     assert str(bench.sent("Traversability")[-1]["State"]) == "go"
     bench.away = True
     bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
-    bench.run(start + 13.2 - gone)  # a window ends meanwhile, and hardly a half second of it is missing
+    bench.run(start + 7.2 - gone)  # a window ends meanwhile, and hardly a half second of it is missing
     bench.away = False
-    bench.run(start + 13.95 - bench.clock.now)
+    bench.run(start + 7.95 - bench.clock.now)
     assert bench.bus.is_open
     assert 3 in [result.index for result in bench.results]
     since = [str(f["State"]) for f in bench.sent("Traversability", since=gone + 0.01)]
@@ -405,13 +412,14 @@ class Stamped(ScriptedBus):
 
 
 @pytest.mark.parametrize("by", [-3600.0, 20.0])
-def test_a_clock_that_is_set_begins_windows_anew_at_once(recording, by):
+def test_a_clock_that_is_set_begins_windows_anew_at_once(by):
     """With it set ahead the service handed out a window of nothing for each second that never was."""
-    since, window = 7.0, 4.0
-    bench = Bench(recording, reference_configuration([f"estimator.window={window}"]))
-    bench.wire = Stamped(bench.clock, recording, by, since)
-    bench.run(DURATION)
-    start = recording[0].timestamp
+    since, window, duration = 7.0, 4.0, 16.0
+    messages = drive_messages(CONFIG, duration)
+    bench = Bench(messages, CONFIG)
+    bench.wire = Stamped(bench.clock, messages, by, since)
+    bench.run(duration)
+    start = messages[0].timestamp
     ends = [r.t - start for r in bench.results]
     before, after = ends[:-5], ends[-5:]
     assert before == pytest.approx([4.0, 5.0, 6.0, 7.0][: len(before)], abs=0.01)
@@ -421,25 +429,25 @@ def test_a_clock_that_is_set_begins_windows_anew_at_once(recording, by):
     assert [r.index for r in bench.results] == list(range(len(ends)))
 
 
-def test_garbled_frames_change_nothing_but_a_count(recording):
-    clean, garbled = Bench(recording), Bench(recording)
-    for bench in (clean, garbled):
-        while bench.clock.now < 1000.0 + DURATION - 1.0:
-            if bench is garbled and len(garbled.wire.fail_receive) == 0:
-                garbled.wire.fail_receive.append(ValueError("invalid literal for int() with base 16: 'x3'"))
-            bench.run(0.5)
+def test_garbled_frames_change_nothing_but_a_count(recording, good):
+    garbled = Bench(recording, CONFIG)
+    while garbled.clock.now < 1000.0 + DURATION - 1.0:
+        if len(garbled.wire.fail_receive) == 0:
+            garbled.wire.fail_receive.append(ValueError("invalid literal for int() with base 16: 'x3'"))
+        garbled.run(0.4)
     assert garbled.bus.counts.garbled > 20
     assert garbled.bus.counts.lost == 0
-    assert [(r.t, r.samples, r.status) for r in garbled.results] == [(r.t, r.samples, r.status) for r in clean.results]
-    assert len(clean.results) >= 5
+    found, clean = ([(r.t, r.samples, r.status) for r in bench.results] for bench in (garbled, good))
+    assert len(found) >= 5
+    assert found == clean[: len(found)]
 
 
 def test_a_frame_that_is_not_for_us_says_nothing_of_those_behind_it(recording):
     """The machine stands still as a window ends; a frame under our identifier is the first that waits."""
     samples = []
     for theirs in (False, True):
-        bench = Bench(recording)
-        bench.run(9.895)
+        bench = Bench(recording, CONFIG)
+        bench.run(3.895)
         following = bench.wire.next
         if theirs:
             at = recording[following].timestamp
@@ -464,9 +472,9 @@ class SlowBus(ScriptedBus):
 
 def test_a_loop_that_falls_behind_says_so_and_nothing_it_reads_is_fresh(recording):
     """Half of the frames that come can be taken: what is read is ever older, and the frames still go out in time."""
-    bench = Bench(recording)
+    bench = Bench(recording, CONFIG)
     bench.wire = wire = SlowBus(bench.clock, recording)
-    bench.run(DURATION - 5.0)
+    bench.run(DURATION - 4.0)
     assert str(bench.sent("Traversability")[-1]["State"]) == "go"
     wire.cost = 2.0 * DURATION / len(recording)
     began = bench.run(6.0)
@@ -495,12 +503,12 @@ class Told(Notifier):
 
 
 def test_inputs_whose_samples_are_all_refused_are_called_so_and_not_silent(recording):
-    loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    loads = load_databases(CONFIG).get_message_by_name("WheelLoads").frame_id
     cut = [copy(message) for message in recording]
     for message in cut:
         if message.arbitration_id == loads and message.timestamp > recording[0].timestamp + 5.0:
             message.data = message.data[:7]
-    bench = Bench(cut)
+    bench = Bench(cut, CONFIG)
     bench.service.notifier = told = Told()
     bench.run(4.9)
     assert bench.sent("SoilbusStatus")[-1]["RejectedShare"] == 0.0
@@ -518,10 +526,10 @@ def test_inputs_whose_samples_are_all_refused_are_called_so_and_not_silent(recor
 @pytest.mark.parametrize("step", [0.0, -3600.0])
 def test_an_input_that_has_had_no_time_to_come_is_not_called_missing(recording, step):
     """Frames begin, or the clock is set, a moment before a status is due, and the loads come last."""
-    loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    loads = load_databases(CONFIG).get_message_by_name("WheelLoads").frame_id
     begin, changes = recording[0].timestamp, recording[0].timestamp + (0.0 if step == 0.0 else 3.0)
     messages = [copy(m) for m in recording if m.arbitration_id != loads or not 0.0 <= m.timestamp - changes < 0.3]
-    bench = Bench(messages)
+    bench = Bench(messages, CONFIG)
     bench.wire.offset -= 0.9
     bench.run(0.9 + changes - begin)
     for message in messages:
@@ -537,12 +545,12 @@ def test_an_input_that_has_had_no_time_to_come_is_not_called_missing(recording, 
 
 def test_after_a_pause_of_an_input_its_windows_say_why_they_are_not_valid(recording):
     """A window with a hole in it is no reason that inputs fail now."""
-    loads = load_databases(reference_configuration()).get_message_by_name("WheelLoads").frame_id
+    loads = load_databases(CONFIG).get_message_by_name("WheelLoads").frame_id
     begin = recording[0].timestamp
-    bench = Bench([m for m in recording if m.arbitration_id != loads or not 11.0 < m.timestamp - begin < 12.5])
+    bench = Bench([m for m in recording if m.arbitration_id != loads or not 5.0 < m.timestamp - begin < 6.5], CONFIG)
     bench.run(DURATION - 0.5)
     assert bench.results[-1].reason.startswith("input_stale load.FL")
-    again = [f for f in bench.sent("SoilbusStatus") if f["at"] + bench.wire.offset > begin + 13.5]
+    again = [f for f in bench.sent("SoilbusStatus") if f["at"] + bench.wire.offset > begin + 7.5]
     assert len(again) >= 2
     assert {(str(f["State"]), str(f["Reason"])) for f in again} == {("degraded", "input_stale")}
     of_loop = {str(f["State"]) for f in bench.sent("Traversability", since=again[0]["at"])}

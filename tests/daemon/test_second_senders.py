@@ -19,7 +19,7 @@ from soilbus.cli.main import main
 from soilbus.sensors.survey import survey
 from soilbus.simulator.reference import reference_configuration
 
-CONFIG, DURATION = reference_configuration(), 16.0
+CONFIG, DURATION = reference_configuration(["estimator.window=4"]), 10.0
 MOTOR = load_databases(CONFIG).get_message_by_name("MotorFL").frame_id
 
 
@@ -58,13 +58,13 @@ def findings(heard: list[can.Message]) -> list[str]:
 
 
 def test_a_second_sender_of_an_input_ends_go_and_is_named(recording, caplog):
-    bench = Bench(joined(recording, 12.5, 13.5))
+    bench = Bench(joined(recording, 6.5, 7.5), CONFIG)
     start = bench.clock.now
     bench.run(DURATION)
-    said = {str(f["State"]) for f in bench.sent("Traversability", since=start + 13.0) if f["at"] < start + 16.4}
+    said = {str(f["State"]) for f in bench.sent("Traversability", since=start + 7.0) if f["at"] < start + 10.4}
     assert said == {"unknown"}
-    assert bench.sent("Traversability", since=start + 12.4)[0]["State"] == "go"
-    status = [f for f in bench.sent("SoilbusStatus", since=start + 13.1) if f["at"] < start + 16.4]
+    assert bench.sent("Traversability", since=start + 6.4)[0]["State"] == "go"
+    status = [f for f in bench.sent("SoilbusStatus", since=start + 7.1) if f["at"] < start + 10.4]
     assert {(str(f["State"]), str(f["Reason"])) for f in status} == {("degraded", "input_rejected")}
     assert "input_rejected torque.FL (second_sender)" in caplog.text
     assert "frames of MotorFL are refused: the Counter does not go on by one: a second sender" in caplog.text
@@ -73,7 +73,7 @@ def test_a_second_sender_of_an_input_ends_go_and_is_named(recording, caplog):
 @pytest.mark.parametrize("share", [0.1, 0.5])
 def test_a_share_of_wrong_checksums_is_said_in_status_and_journal(recording, caplog, share):
     notifier = Notes()
-    Bench(damaged(recording, share), notifier=notifier).run(DURATION)
+    Bench(damaged(recording, share), CONFIG, notifier=notifier).run(DURATION)
     for text in (caplog.text, notifier.said):
         found = re.findall(r"(\d+)% of \d+ frames of MotorFL are refused: wrong Checksum: a second sender", text)
         assert float(found[-1]) == pytest.approx(100.0 * share, abs=6.0)
@@ -81,19 +81,20 @@ def test_a_share_of_wrong_checksums_is_said_in_status_and_journal(recording, cap
 
 def test_a_good_bus_has_no_doubts(recording, caplog):
     notifier = Notes()
-    Bench(recording, notifier=notifier).run(DURATION)
+    Bench(recording, CONFIG, notifier=notifier).run(DURATION)
     assert "refused" not in notifier.said + caplog.text
 
 
-@pytest.mark.parametrize("last", [7.0, 15.0])
+@pytest.mark.parametrize("last", [4.0, 9.0])
 def test_check_names_a_second_sender_of_any_share(recording, last):
-    (text,) = (text for text in findings(joined(recording, 6.0, last)) if "wheel.FL.torque:" in text)
+    (text,) = (text for text in findings(joined(recording, 3.0, last)) if "wheel.FL.torque:" in text)
     assert "values of MotorFL.ShaftTorque do not count: the Counter does not go on by one: a second sender" in text
 
 
 def test_replay_names_a_second_sender_in_its_windows_and_its_summary(recording, tmp_path, capsys):
-    write_log(joined(recording, 6.0, 15.0), tmp_path / "drive.log")
-    assert main(["replay", "--config", "tractor", str(tmp_path / "drive.log"), "--json", str(tmp_path / "out")]) == 0
+    write_log(joined(recording, 2.0, 9.0), tmp_path / "drive.log")
+    short = ["--set", "estimator.window=4", str(tmp_path / "drive.log"), "--json", str(tmp_path / "out")]
+    assert main(["replay", "--config", "tractor", *short]) == 0
     said = capsys.readouterr().out
     assert re.search(r"^\d+% of \d+ frames of MotorFL are refused: .* a second sender", said, re.M)
     assert "torque.FL, torque_limit.FL: the counters do not go on by one: look for a second sender" in said

@@ -15,16 +15,15 @@ from soilbus.decision.balance import Duty, balance
 from soilbus.decision.capability import Demand, assess, slip_grid
 from soilbus.decision.sigma_points import SigmaPoints
 from soilbus.decision.wheels import WheelTable, wheel_table
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+from soilbus.trials.windows import observed
 from statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
@@ -362,9 +361,7 @@ def test_a_point_without_a_value_is_mirrored():
 def fitted(name: str, slip: Swing) -> Posterior:
     """What 10 s of a drive tell of a soil."""
     recording = simulate(CONFIG, Scenario(10.0, (Patch(0.0, name),), slip=slip), 3)
-    store = Bins(RIG, 0.1, 0.0)
-    store.add({n: (c.t, c.value) for n in RIG.channels if (c := recording.channels.get(n)) is not None})
-    fit = fit_window(ObservationModel(store.window(0.0, 10.0), RIG, model_of(CONFIG), 0.2), prior_of(CONFIG))
+    fit = fit_window(observed(CONFIG, recording.channels, 10.0), prior_of(CONFIG))
     assert fit is not None
     return fit.posterior
 

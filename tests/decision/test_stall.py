@@ -84,7 +84,7 @@ DIGS = {"rover": 0.4, "tractor": 0.12, "creeping": 0.6}
 """Resistance over weight for each metre that the wheels turn more than the vehicle goes [1/m]."""
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("machine", MACHINES)
 def test_a_vehicle_that_digs_itself_in_is_warned_before_it_stands(machine, seed):
     samples, stood = drive(seed, softens_at=9.0, digs=DIGS[machine], duration=40.0, **MACHINES[machine])
@@ -94,7 +94,7 @@ def test_a_vehicle_that_digs_itself_in_is_warned_before_it_stands(machine, seed)
     assert 8.0 < begun[0] < stood - 0.3
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize(
     "ordinary",

@@ -10,23 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from records import recorded
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.gap import Gap
-from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms, Term
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.diagnosis.where import Disagreement
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of
 from soilbus.offline.diagnose import Findings
 from soilbus.offline.recordings import Recordings
 from soilbus.report.diagnosis import diagnosis_report
 from soilbus.report.findings import findings_json, findings_text
 from soilbus.report.page import Source
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -41,10 +39,7 @@ OFFSET = Addition(CATALOGUE["draft_offset"], 0.6, {"grade": 0.3, "bulldozing": 0
 @pytest.fixture(scope="module")
 def findings() -> Findings:
     """A plain drive, said to be ambiguous."""
-    rig, store = rig_of(CONFIG), Bins(rig_of(CONFIG), 0.1, 0.0)
-    channels = simulate(CONFIG, excited("loam", 24.0), seed=2).channels
-    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-    record = record_of("<a & b>.log", store.window(0.0, 24.0), rig, model_of(CONFIG), 0.2, 0.15)
+    record = recorded(excited("loam", 24.0), 2, name="<a & b>.log")
     base, completed = (fit_model([record], prior_of(CONFIG), effects) for effects in ((), (OFFSET.effect,)))
     assert base is not None
     assert completed is not None

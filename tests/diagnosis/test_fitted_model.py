@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from records import recorded
+from soilbus.can.channels import Column
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.options import DiagnosisOptions
-from soilbus.diagnosis.records import record_of
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
+from soilbus.estimation.assembly import prior_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -17,21 +16,12 @@ DURATION = 40.0
 
 def wandering(rate: float, seed: int):
     """A drive on loam during which the zero at the hitch wanders at a rate [N/s] to 300 N at its end."""
-    config = reference_configuration()
-    store = Bins(rig_of(config), 0.1, 0.0)
-    channels = simulate(config, excited("loam", DURATION), seed=seed).channels
-    columns = {name: (c.t, c.value) for name, c in channels.items() if name in rig_of(config).channels}
-    t, draft = columns["draft"]
-    store.add(columns | {"draft": (t, draft + 300.0 + rate * (t - DURATION))})
-    return record_of(
-        f"{seed}",
-        store.window(0.0, DURATION),
-        rig_of(config),
-        model_of(config),
-        0.2,
-        0.15,
-        DiagnosisOptions(instant=0.1),
-    )
+
+    def moved(recording):
+        t, draft = recording.channels["draft"].t, recording.channels["draft"].value
+        return {"draft": Column(t, draft + 300.0 + rate * (t - DURATION))}
+
+    return recorded(excited("loam", DURATION), seed, edit=moved, options=DiagnosisOptions(instant=0.1))
 
 
 def test_each_recording_has_a_wander_of_its_own():

@@ -7,20 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import records
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.options import DiagnosisOptions
-from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import Verdict
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_at
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.solver import Objective, minimise
 from soilbus.report.statement import doubt
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -36,11 +34,7 @@ def record():
 
 
 def recorded(soil="loam", hidden=()):
-    rig = rig_of(CONFIG)
-    store = Bins(rig, 0.1, 0.0)
-    channels = simulate(CONFIG, excited(soil, 60.0), 5, hidden).channels
-    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-    return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15, DiagnosisOptions(instant=0.1))
+    return records.recorded(excited(soil, 60.0), 5, *hidden, options=DiagnosisOptions(instant=0.1))
 
 
 def test_a_fit_from_the_optimum_with_the_latents_as_measured_ends_with_them_at_their_optimum():

@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from records import recorded
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.gap import gap_of
 from soilbus.diagnosis.noise_floor import with_noise_floor
-from soilbus.diagnosis.records import Record, record_of
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.assembly import prior_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -29,11 +28,7 @@ TWICE = ["noise.torque.of_mean=0.02", "noise.draft.absolute=80"]
 
 
 def record_with(effects=(), noise=()):
-    config = reference_configuration(list(noise))
-    rig, store = rig_of(config), Bins(rig_of(config), 0.1, 0.0)
-    channels = simulate(CONFIG, excited("loam", SECONDS), 4, effects).channels
-    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-    return record_of("drive", store.window(0.0, SECONDS), rig, model_of(CONFIG), 0.2, 0.15)
+    return recorded(excited("loam", SECONDS), 4, *effects, config=reference_configuration(list(noise)), truth=CONFIG)
 
 
 @pytest.fixture(scope="module")

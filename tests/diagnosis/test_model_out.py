@@ -10,27 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from records import recorded
 from soilbus.config.edit import with_effects_text
 from soilbus.config.file import load_config, located, shipped_dbc
 from soilbus.config.model import ConfigError
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.model_out import effect_tables
-from soilbus.diagnosis.records import record_of
-from soilbus.estimation.assembly import effects_and_parameters_of, model_of, prior_of, rig_of
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
+from soilbus.estimation.assembly import effects_and_parameters_of, prior_of, rig_of
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-
-
-@pytest.fixture(scope="module")
-def record():
-    config = reference_configuration()
-    store = Bins(rig_of(config), 0.1, 0.0)
-    channels = simulate(config, excited("loam", 30.0), seed=2).channels
-    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig_of(config).channels})
-    return record_of("x", store.window(0.0, 30.0), rig_of(config), model_of(config), 0.2, 0.15)
 
 
 def written(tmp_path: Path, tables, overrides=(), notes=()) -> Path:
@@ -39,9 +28,9 @@ def written(tmp_path: Path, tables, overrides=(), notes=()) -> Path:
     return path
 
 
-def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
+def test_what_is_written_is_the_model_that_was_fitted(tmp_path):
     effects = [CATALOGUE[name] for name in ("draft_offset", "wheel_load_offset", "soil_drift")]
-    fitted = fit_model([record], prior_of(reference_configuration()), effects)
+    fitted = fit_model([recorded(excited("loam", 30.0), 2)], prior_of(reference_configuration()), effects)
     tables, notes = effect_tables(fitted)
     config = load_config(written(tmp_path, tables, notes=notes))
     kept, free = effects_and_parameters_of(config)

@@ -13,13 +13,11 @@ from published_wheels import (
     records_of,
     strain,
 )
+from records import recorded
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
-from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.verdict import Verdict, gap_limit
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
+from soilbus.estimation.assembly import prior_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -106,15 +104,8 @@ def test_points_without_torque_are_diagnosed(points):
 
 def test_the_papers_shear_law_against_exponential_soil_is_named():
     """Xi et al. 2024 take tau = (c + sigma tan phi) j / (j + K); the simulated soil follows Janosi and Hanamoto."""
-    seconds = 60.0
-    recording = simulate(reference_configuration(), excited("dry_sand", seconds), 3, ())
     config = reference_configuration(['model.shear_law="rational"'])
-    rig = rig_of(config)
-    bins = Bins(rig, config.estimator.bin, 0.0)
-    bins.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
-    settings = config.estimator
-    window = bins.window(0.0, seconds)
-    record = record_of("drive", window, rig, model_of(config), settings.min_speed, settings.max_turn)
+    record = recorded(excited("dry_sand", 60.0), 3, config=config, truth=reference_configuration())
     found = diagnose([record], prior_of(config), list(CATALOGUE.values()))
     assert found.verdict is Verdict.NAMED
     assert [addition.effect.name for addition in found.additions] == ["exponential_shear"]

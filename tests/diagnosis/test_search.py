@@ -7,17 +7,15 @@ from itertools import islice, product
 import numpy as np
 import pytest
 
+from records import recorded
 from soilbus.diagnosis.fitted_model import fit_model
-from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import further_scores, normal_equations, scores
 from soilbus.estimation import multistart
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.solver import minimise
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -27,18 +25,13 @@ from tests.lab.blind.trial import record_of_case
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
-DURATION = 60.0
 SLIP_SINKAGE = CATALOGUE["slip_sinkage"]
 
 
 @pytest.fixture(scope="module")
 def record():
-    rig = rig_of(CONFIG)
-    store = Bins(rig, 0.1, 0.0)
     hidden = Active(SLIP_SINKAGE, {"exponent": 0.3, "softening": 0.0, "dug": 0.0})
-    channels = simulate(CONFIG, excited("loam", DURATION), 11, (hidden,)).channels
-    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-    return record_of("x", store.window(0.0, DURATION), rig, model_of(CONFIG), 0.2, 0.15)
+    return recorded(excited("loam", 60.0), 11, hidden)
 
 
 @pytest.fixture(scope="module")

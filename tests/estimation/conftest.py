@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
+from driven_windows import c_and_K_missed
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, Window
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.wheel import Soil
-
-SPREAD = float(np.sqrt(np.log1p(0.25**2)))
-"""Sd of the logarithm of a parameter known to 25 %."""
+from soilbus.trials.windows import bins_of
 
 
 @dataclass(frozen=True)
@@ -40,19 +37,13 @@ class Case:
         return ObservationModel(window or self.window, rig or self.rig, model_of(self.config), 0.2)
 
 
-def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable[str] = ()) -> Case:
-    """10 s with slip swept from 0.05 to 0.4; c and K are known to 25 %, so their priors miss by as much."""
-    miss = np.exp(SPREAD * np.random.default_rng([seed, 77]).standard_normal(2))
-    means = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
-    settings = [f"soil.{name}.{key}={v * f}" for name, v in means.items() for key, f in (("value", 1.0), ("std", 0.25))]
-    config = reference_configuration([*settings, *overrides])
-    scenario = Scenario(10.0, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
-    rig = rig_of(config)
-    channels = simulate(config, scenario, seed).channels
-    wanted = [name for name in rig.channels if name in channels and name.partition(".")[0] not in without]
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({name: (channels[name].t, channels[name].value) for name in wanted})
-    return Case(soil, config, rig, store.window(0.0, 10.0))
+def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable[str] = (), **scenario: Swing) -> Case:
+    """10 s, unless told otherwise with slip swept from 0.05 to 0.4; c and K are known to 25 %, so priors miss them."""
+    config = reference_configuration([*c_and_K_missed(soil, seed), *overrides])
+    drive = Scenario(10.0, (Patch(0.0, "this", soil),), **({"slip": Swing(0.05, 0.40)} | scenario))
+    channels = simulate(config, drive, seed).channels
+    wanted = {name: column for name, column in channels.items() if name.partition(".")[0] not in without}
+    return Case(soil, config, rig_of(config), bins_of(config, wanted).window(0.0, 10.0))
 
 
 @pytest.fixture(scope="session")

@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import ObservationModel
-from soilbus.sensors.bins import Bins
-from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.scenario import Swing
 from soilbus.terra.soils import SOILS
 
 DRIVES = {
@@ -19,26 +14,16 @@ DRIVES = {
     "braking alone": {"slip": Swing(-0.2, -0.02)},
     "harsh": {"slip": Swing(-0.2, 0.3), "speed": Swing(0.8, 2.5, 0.2, 0.5)},  # to 2 m/s^2
 }
-SPREAD = float(np.sqrt(np.log1p(0.25**2)))
 
 
 @pytest.mark.parametrize("what", DRIVES)
-def test_errors_are_as_large_as_the_posterior_says(what):
+def test_errors_are_as_large_as_the_posterior_says(what, simulated):
     away, chi2, braking = [], [], []
     for k, name in enumerate(("loam", "clayey_soil_38", "wet_clay")):
         for seed in range(3):
-            soil = SOILS[name]
-            miss = np.exp(SPREAD * np.random.default_rng([seed, 77]).standard_normal(2))
-            told = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
-            config = reference_configuration(
-                f"soil.{n}.{key}={v * f}" for n, v in told.items() for key, f in (("value", 1.0), ("std", 0.25))
-            )
-            rig = rig_of(config)
-            heard = simulate(config, Scenario(10.0, (Patch(0.0, "this", soil),), **DRIVES[what]), 1000 * k + seed)
-            store = Bins(rig, 0.1, 0.0)
-            store.add({n: (heard.channels[n].t, heard.channels[n].value) for n in rig.channels if n in heard.channels})
-            problem = ObservationModel(store.window(0.0, 10.0), rig, model_of(config), 0.2)
-            fit = fit_window(problem, prior_of(config))
+            case = simulated(SOILS[name], 1000 * k + seed, **DRIVES[what])
+            soil, problem = case.soil, case.problem()
+            fit = fit_window(problem, case.prior)
             assert fit.converged
             bearing, tan_phi = fit.posterior.bearing_pressure(0.02, 0.3), fit.posterior.tan_phi()
             n = fit.posterior.parameters()["n"]

@@ -13,7 +13,7 @@ from soilbus.simulator.reference import reference_configuration
 SOILS = ("loam", "wet_clay", "dry_sand")
 WINDOWS = {2.0: 20, 20.0: 8}
 """Of each length and soil; with and without sinkage sensors from the same drives."""
-WINDOWS_OF_ANY_K_C = {10.0: 8}
+WINDOWS_OF_ANY_K_C = {10.0: 5}
 QUANTITIES = (*PARAMETERS, "bearing_pressure")
 MAX_RMS, LOW, HIGH, CHI2_OFF = 1.15, 0.93, 0.97, 0.03
 CHANCE = 1e-3

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import shaking
-from soilbus.can.channels import Column, Decoded
-from soilbus.can.dbc_files import load_databases
+from driven_windows import results_of
+from soilbus.can.channels import Column
 from soilbus.config.file import found_configuration, load_config, parse_config
 from soilbus.config.model import Axle, Signal
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
@@ -24,9 +24,7 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import NoiseTable, forward, made_window
 from soilbus.pipeline.modelled_drive import modelled_drive
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.report.configuration import load_lines
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -34,6 +32,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil, state_on, wheel_forces
+from soilbus.trials.windows import bins_of, observed
 from tests.lab import computed_loads
 
 FIELD = Path(__file__).parents[1] / "field" / "field.toml"
@@ -368,9 +367,7 @@ def test_an_axle_without_a_cell_does_not_lose_what_bouncing_adds_to_the_other():
     config = reference_configuration(path=REFERENCES["tractor-2wd"])
     scenario = Scenario(20.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3), bounce=0.12)
     recording, rig = simulate(config, scenario, 7), rig_of(config)
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels})
-    window = completed(forward(store.window(0.0, 20.0)), rig)
+    window = completed(forward(bins_of(config, recording.channels).window(0.0, 20.0)), rig)
     front, rear = (
         np.sum([np.interp(window.t, recording.truth["t"], recording.truth[f"load.{w}"]) for w in wheels], axis=0)
         for wheels in (("FL", "FR"), ("RL", "RR"))
@@ -389,9 +386,7 @@ def test_torques_of_the_two_wheels_of_an_axle_show_how_its_load_is_shared_at_eac
     config = config.model_copy(update={"wheel": wheels, "axle": axles})
     scenario = Scenario(10.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.4), bounce=0.12)
     recording, rig = simulate(config, scenario, 3), rig_of(config)
-    store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels})
-    problem = ObservationModel(store.window(0.0, 10.0), rig, model_of(config), 0.2)
+    problem = observed(config, recording.channels, 10.0)
     fit = fit_window(problem, prior_of(config))
     assert fit is not None
     for left, right in ((0, 1), (2, 3)):
@@ -402,21 +397,9 @@ def test_torques_of_the_two_wheels_of_an_axle_show_how_its_load_is_shared_at_eac
 
 
 def estimated(config, drive):
-    pipeline = Pipeline(config, load_databases(config))
     channels = {name: Column(t, value) for name, (t, value) in drive.channels.items()}
-    rear, other = drive.channels["load.RL"], drive.channels["load.RR"]
-    channels["load.rear"] = Column(rear[0], rear[1] + other[1])
-    known = set(pipeline.intake.rig.channels)
-    results = []
-    for since in np.arange(0.0, drive.truth["t"][-1], 1.0):
-        part = {}
-        for name, column in channels.items():
-            now = (column.t >= since) & (column.t < since + 1.0)
-            if name in known:
-                part[name] = Column(column.t[now], column.value[now])
-        pipeline.intake.add(Decoded(part))
-        results += pipeline.advance(since + 1.0)
-    return results
+    (t, left), (_, right) = drive.channels["load.RL"], drive.channels["load.RR"]
+    return results_of(config, channels | {"load.rear": Column(t, left + right)}, drive.truth["t"][-1])
 
 
 @pytest.mark.parametrize("name", ["tractor-2wd", "tractor-axles"])

@@ -10,13 +10,13 @@ import pytest
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
-from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import forces_with
 from soilbus.terra.soils import SOILS
+from soilbus.trials.windows import bins_of
 
 SOIL = SOILS["loam"]
 PULL = 0.3
@@ -31,10 +31,9 @@ def problems() -> dict[str, ObservationModelWithEffects]:
     found = {}
     for law in ("exponential", "rational"):
         config = reference_configuration([f"model.shear_law={law}"])
-        rig, store = rig_of(config), Bins(rig_of(config), 0.1, 0.0)
         channels = simulate(reference_configuration(), excited("loam", 6.0), seed=3).channels
-        store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-        found[law] = ObservationModelWithEffects(store.window(0.0, 6.0), rig, model_of(config), 0.2)
+        window = bins_of(config, channels).window(0.0, 6.0)
+        found[law] = ObservationModelWithEffects(window, rig_of(config), model_of(config), 0.2)
     return found
 
 

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from driven_windows import errors, tracker_of, windows
-from soilbus.can.channels import Column, Decoded
-from soilbus.can.dbc_files import load_databases
+from driven_windows import errors, last_fit, results_of, windows
 from soilbus.config.file import load_config
 from soilbus.config.model import ConfigError
 from soilbus.decision.balance import Duty, balance
@@ -24,7 +22,6 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import PARAMETERS, Posterior
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -37,7 +34,7 @@ CRAWLER = Path(__file__).parents[1] / "field" / "tracked.toml"
 WITH_CELLS = (
     "track.L.load=WheelLoads.FL", "track.R.load=WheelLoads.FR", "noise.load.relative=0.01", "noise.load.gain=0.005",
 )  # fmt: skip
-WEIGHT, R, B, L, MOST = 4500.0 * 9.80665, 0.30, 0.35, 1.6, 8000.0
+WEIGHT, R, B, L = 4500.0 * 9.80665, 0.30, 0.35, 1.6
 LOAM = SOILS["loam"]
 NO_LIMIT = np.full(2, np.nan)
 
@@ -112,12 +109,7 @@ def test_the_simulated_crawler_obeys_its_formulas():
 def test_a_drive_with_swinging_draft_gives_the_soil(cells):
     config, found = crawler(*cells), []
     for seed in range(3):
-        tracker, output = tracker_of(config), None
-        for window, end in windows(config, simulate(config, pulling(), seed)):
-            output = tracker.estimate(window, end)
-        assert output is not None
-        assert output.fit is not None
-        found.append(errors(output.fit.posterior, LOAM))
+        found.append(errors(last_fit(config, simulate(config, pulling(), seed)).posterior, LOAM))
     assert np.abs(found).max() < 3.0  # of bearing pressure and tan phi, in their sd
     assert np.sqrt(np.square(found).mean()) < 2.0
 
@@ -216,30 +208,11 @@ def test_intervals_hold_on_soils_drawn_from_the_prior(swing, cells):
     found = []
     for seed, soil in zip(range(drives), soils_of_the_prior(config, 7), strict=False):
         ground = replace(pulling(soil, 30.0), side_shift=Swing(-swing, swing))
-        tracker, output = tracker_of(config), None
-        for window, end in windows(config, simulate(config, ground, seed)):
-            output = tracker.estimate(window, end)
-        assert output is not None
-        assert output.fit is not None
-        found.append(errors(output.fit.posterior, soil))
+        found.append(errors(last_fit(config, simulate(config, ground, seed)).posterior, soil))
     rms, covered = np.sqrt(np.square(found).mean(axis=0)), np.mean(np.abs(found) < 1.96, axis=0)
     judged = slice(1, 2) if swing and not cells else slice(2)  # loads that shift unseen for seconds bias the pressure
     assert covered[judged].min() > 0.7  # at 0.95 each, fewer than 5 of 6 happen once in 30
     assert rms[judged].max() < 1.6
-
-
-def results_of(config, ground, seed=3):
-    """What the pipeline says of a drive, second by second."""
-    recording, pipeline = simulate(config, ground, seed), Pipeline(config, load_databases(config))
-    results = []
-    for since in np.arange(0.0, ground.duration, 1.0):
-        part = {}
-        for name, column in recording.channels.items():
-            now = (column.t >= since) & (column.t < since + 1.0)
-            part[name] = Column(column.t[now], column.value[now])
-        pipeline.intake.add(Decoded(part))
-        results += pipeline.advance(since + 1.0)
-    return results
 
 
 @pytest.mark.parametrize("name", ["loam", "dry_sand"])
@@ -248,7 +221,8 @@ def test_a_draft_that_hardly_moves_is_enough_for_strength_and_thrust(cells, name
     """The draft moves by 3 %: c + p tan phi at the tracks' pressure is determined, its two parts are not."""
     soil, pressure = SOILS[name], WEIGHT / (2.0 * B * L)
     ground = replace(pulling(name, 20.0), draft=Swing(0.97 * 18e3, 1.03 * 18e3))
-    results = results_of(crawler(*cells), ground)
+    config = crawler(*cells)
+    results = results_of(config, simulate(config, ground, 3).channels, ground.duration)
     assert len(results) >= 10
     assert {result.status for result in results} == {Status.VALID}
     for result in results[::5]:
@@ -260,7 +234,8 @@ def test_a_draft_that_hardly_moves_is_enough_for_strength_and_thrust(cells, name
 
 
 def test_a_crawler_that_pulls_nothing_lacks_a_range_of_slips():
-    results = results_of(crawler(), replace(pulling("loam", 14.0), draft=Swing(0.0, 1.0)))
+    recording = simulate(crawler(), replace(pulling("loam", 14.0), draft=Swing(0.0, 1.0)), 3)
+    results = results_of(crawler(), recording.channels, 14.0)
     assert {result.reason for result in results} == {"not_excited slip_range"}
 
 
@@ -284,11 +259,8 @@ def on_a_line_of_one_strength(config, soil: Soil) -> tuple[float, float]:
 @pytest.mark.parametrize("name", ["dry_sand", "loam", "wet_clay"])
 def test_at_constant_load_tan_phi_is_that_of_the_prior_on_the_line_of_one_strength(name):
     """Wet clay (c at +1.5, phi at -1.0 sd of the prior) is 2.2 sd off in the exact posterior, too."""
-    config = crawler("estimator.hop=10")
-    tracker = tracker_of(config)
-    for window, end in windows(config, simulate(config, replace(pulling(name, 30.0), side_shift=Swing(0.0, 0.0)), 3)):
-        fit = tracker.estimate(window, end).fit
-    found = fit.posterior.tan_phi()
+    config, ground = crawler("estimator.hop=10"), replace(pulling(name, 30.0), side_shift=Swing(0.0, 0.0))
+    found = last_fit(config, simulate(config, ground, 3)).posterior.tan_phi()
     mean, std = on_a_line_of_one_strength(config, SOILS[name])
     assert abs(found.value - mean) < 0.5 * std
     assert 0.95 * std < found.std < 1.35 * std  # and the strength is not known exactly
@@ -306,9 +278,7 @@ def test_strength_and_shear_modulus_from_sprocket_torque_speed_and_ground_speed(
     for seed in range(2):
         recording = simulate(towed, replace(pulling(name, 20.0), side_shift=Swing(0.0, 0.0)), seed)
         channels = {c: v for c, v in recording.channels.items() if c.partition(".")[0] not in ("draft", "sinkage")}
-        tracker = tracker_of(config)
-        for window, end in windows(config, replace(recording, channels=channels)):
-            fit = tracker.estimate(window, end).fit
+        fit = last_fit(config, replace(recording, channels=channels))
         posterior, K = fit.posterior, fit.posterior.parameters()["K"]
         strength = posterior.soil.c + pressure * posterior.tan_phi().value
         assert strength == pytest.approx(soil.c + pressure * np.tan(soil.phi), rel=0.05)
@@ -325,10 +295,7 @@ def test_a_crawler_with_peaks_below_its_rollers_is_simulated_and_estimated_with_
     for name in "LR":  # the rut is as deep as twice the mean pressure presses it
         z = (2.0 * truth[f"load.{name}"] / (B * L) / (LOAM.k_c / B + LOAM.k_phi)) ** (1.0 / LOAM.n)
         assert truth[f"sinkage.{name}"] == pytest.approx(z, rel=1e-6)
-    tracker = tracker_of(config)
-    for window, end in windows(config, recording):
-        output = tracker.estimate(window, end)
-    assert np.abs(errors(output.fit.posterior, LOAM)).max() < 3.0
+    assert np.abs(errors(last_fit(config, recording).posterior, LOAM)).max() < 3.0
     uniform = assess(Posterior(LOAM, np.zeros((6, 6))), rig_of(config), WheelModel(), None, NO_LIMIT, 0.6, 0.25)[0]
     peaked = assess(Posterior(LOAM, np.zeros((6, 6))), rig_of(config), model_of(config), None, NO_LIMIT, 0.6, 0.25)[0]
     assert peaked.max_draft.value < uniform.max_draft.value  # more resistance, a little less thrust

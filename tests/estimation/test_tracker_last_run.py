@@ -23,7 +23,7 @@ GAIN_CORRELATION_TIME = 86400.0
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
-NAMES, GAIN_STD = gain_errors(rig_of(CONFIG), model_of(CONFIG), ())
+_, GAIN_STD = gain_errors(rig_of(CONFIG), model_of(CONFIG), ())
 BORDER, SPEED = 25.0, 1.5
 NIGHT = 12.0 * 3600.0
 

@@ -23,7 +23,6 @@ from soilbus.cli.main import main
 from soilbus.config.file import load_config, parse_config
 from soilbus.offline.diagnose import Findings, diagnose_logs
 from soilbus.offline.replay import replay
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.page import Source
 from soilbus.report.replay_pictures import TimeAxis, clock_text, dates
@@ -44,9 +43,13 @@ SECONDS = 30
 
 
 class Made(NamedTuple):
+    """A drive and its reports, with the windows and the findings of which they are made."""
+
     log: Path
     replay: Path
     diagnosis: Path
+    results: list[WindowResult]
+    findings: Findings
 
 
 @pytest.fixture(scope="module")
@@ -62,22 +65,35 @@ def made(tmp_path_factory) -> Made:
     pause = [line for line in lines if code not in line or not 8.0 < float(line[1:18]) - 1.7e9 < 22.0]
     deaf.write_text("".join(pause))
     config, out = ["--config", str(TRACTOR)], (folder / "replay.html", folder / "diagnosis.html")
-    assert main(["replay", *config, str(log), str(deaf), "--report", str(out[0]), "--set", "estimator.hop=2"]) == 0
-    assert main(["diagnose", *config, str(log), "--report", str(out[1])]) == 0
-    return Made(log, *out)
+    results: list[WindowResult] = []
+    found: list[Findings] = []
+
+    def replayed(*arguments: Any, **more: Any) -> Iterator[WindowResult]:
+        for result in replay(*arguments, **more):
+            results.append(result)
+            yield result
+
+    def diagnosed(*arguments: Any, **more: Any) -> Findings:
+        found.append(diagnose_logs(*arguments, **more))
+        return found[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("soilbus.cli.engineer.replay_logs", replayed)
+        patch.setattr("soilbus.offline.diagnose.diagnose_logs", diagnosed)
+        assert main(["replay", *config, str(log), str(deaf), "--report", str(out[0]), "--set", "estimator.hop=2"]) == 0
+        assert main(["diagnose", *config, str(log), "--report", str(out[1])]) == 0
+    return Made(log, *out, results, *found)
 
 
 @pytest.fixture(scope="module")
 def findings(made) -> Findings:
-    return diagnose_logs(load_config(TRACTOR), [made.log])
+    return made.findings
 
 
 @pytest.fixture(scope="module")
 def results(made) -> list[WindowResult]:
     """Windows of the same drive twice, the second time without ground speed for a while."""
-    config = load_config(TRACTOR, ["estimator.hop=2"])
-    logs = [made.log, made.log.with_name("deaf.log")]
-    return list(replay(Pipeline(config, load_databases(config)), logs))
+    return made.results
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ from soilbus.can.candump import frame_of
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.can.log_writer import write_log
 from soilbus.can.publish import Publisher
+from soilbus.cli.main import main
 from soilbus.offline.played_bus import PlayedBus, PlayedClock
 from soilbus.report.dashboard import Dashboard
 from soilbus.report.received_frames import ReceivedFrames
@@ -243,25 +244,20 @@ def test_the_last_page_of_a_recording_stands_until_a_key_ends_it(tmp_path: Path)
     os.close(terminal.far)
 
 
-def watched(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "soilbus", "watch", *arguments], capture_output=True, text=True, timeout=60, check=False
-    )
-
-
-def test_a_recording_in_a_pipe_is_lines_that_name_the_configured_wheels(tmp_path: Path):
+def test_a_recording_in_a_pipe_is_lines_that_name_the_configured_wheels(tmp_path: Path, capfd):
     log = tmp_path / "ours.asc"
     write_log(sent(20.0), log)
-    done = watched(str(log), "--speed", "50", "--config", "tractor")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"^GO, p = 0\.99\. Keep going\. Slip 1\d % at wheel FL\.", done.stdout, re.M)
-    assert "\x1b" not in done.stdout
+    assert main(["watch", str(log), "--speed", "50", "--config", "tractor"]) == 0
+    said, faults = capfd.readouterr()
+    assert faults == ""
+    assert re.search(r"^GO, p = 0\.99\. Keep going\. Slip 1\d % at wheel FL\.", said, re.M)
+    assert "\x1b" not in said
 
 
-def test_a_recording_without_a_frame_of_ours_is_said_in_one_line(tmp_path: Path):
+def test_a_recording_without_a_frame_of_ours_is_said_in_one_line(tmp_path: Path, capfd):
     log = tmp_path / "foreign.log"
     write_log([can.Message(timestamp=1.0, arbitration_id=0x123, is_extended_id=False, data=b"1")], log)
-    done = watched(str(log))
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.count("\n") == 1
-    assert "no frame of soilbus in it" in done.stderr
+    assert main(["watch", str(log)]) == 1
+    said, faults = capfd.readouterr()
+    assert (said, faults.count("\n")) == ("", 1)
+    assert "no frame of soilbus in it" in faults

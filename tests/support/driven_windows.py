@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from soilbus.can.channels import Column
+from soilbus.can.channels import Column, Decoded
+from soilbus.can.dbc_files import load_databases
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import Settings, Tracker
 from soilbus.estimation.window import Window
 from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.simulator.sensors import true_readings
@@ -37,6 +41,13 @@ def c_and_K_known(soil: str) -> list[str]:
     """Settings by which c and K of a soil are known to 25 %."""
     values = {name: getattr(SOILS[soil], name) for name in ("c", "K")}
     return [f"soil.{name}.{key}={v * f}" for name, v in values.items() for key, f in (("value", 1.0), ("std", 0.25))]
+
+
+def c_and_K_missed(soil: Soil, seed: int) -> list[str]:
+    """Settings by which c and K of a soil are known to 25 %, and told off by as much."""
+    miss = np.exp(np.sqrt(np.log1p(0.25**2)) * np.random.default_rng([seed, 77]).standard_normal(2))
+    means = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
+    return [f"soil.{name}.{key}={v * f}" for name, v in means.items() for key, f in (("value", 1.0), ("std", 0.25))]
 
 
 def observed_window(
@@ -64,6 +75,28 @@ def windows(config: Config, recording: Recording) -> Iterator[tuple[Window, floa
     store, length = service_windows.bins_of(config, recording.channels), config.estimator.window
     for end in np.arange(length, recording.truth["t"][-1] + 0.05, config.estimator.hop).tolist():
         yield store.window(end - length, end), end
+
+
+def last_fit(config: Config, recording: Recording) -> Fit:
+    """What a tracker has fitted at the end of a recording."""
+    tracker, output = tracker_of(config), None
+    for window, end in windows(config, recording):
+        output = tracker.estimate(window, end)
+    assert output is not None
+    assert output.fit is not None
+    return output.fit
+
+
+def results_of(config: Config, channels: Mapping[str, Column], duration: float) -> list[WindowResult]:
+    """What the pipeline says of channels, of which it gets what it knows second by second."""
+    pipeline = Pipeline(config, load_databases(config))
+    known = {name: column for name, column in channels.items() if name in pipeline.intake.rig.channels}
+    results: list[WindowResult] = []
+    for since in np.arange(0.0, duration, 1.0).tolist():
+        now = {name: (c.t >= since) & (c.t < since + 1.0) for name, c in known.items()}
+        pipeline.intake.add(Decoded({name: Column(c.t[now[name]], c.value[now[name]]) for name, c in known.items()}))
+        results += pipeline.advance(since + 1.0)
+    return results
 
 
 def errors(posterior: Posterior, soil: Soil) -> np.ndarray:

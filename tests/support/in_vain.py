@@ -106,9 +106,9 @@ def start_after_stop(config: Config, rate: float, top: float, seed: int, lasts: 
     return told(continued(done, config, waits + lasts, starting), config, seed, float(done.columns["t"][-1]) + waits)
 
 
-def halted_by_a_patch(config: Config, seed: int, deceleration: float = 1.0, lasts: float = 8.0) -> Story:
+def halted_by_a_patch(config: Config, seed: int, drives: float = 14.0, lasts: float = 5.0) -> Story:
     """Left wheels meet a soft patch and spin through open differentials until the vehicle stands, and go on."""
-    done = driven(config, seed, 14.0, None)
+    done, deceleration = driven(config, seed, drives, None), 1.0
     speed = float(done.columns["ground_speed"][-1])
 
     def halting(t: np.ndarray) -> dict[str, np.ndarray]:
@@ -271,14 +271,12 @@ def with_weak_motors(
         """(pull, torque, angle, slip, load) of each wheel; a motor at its ceiling slips as much as that takes."""
         front = (WEIGHT * 0.95 - draft * 0.45 - mass * rate * 0.75) / 1.95
         loads = {"front": front / 2.0, "rear": (WEIGHT - front) / 2.0}
+        over_slip = {axle: _at_load(tables[axle], load) for axle, load in loads.items()}
         found = []
         for w, most_torque in zip(config.wheel, ceilings, strict=True):
-            load = loads[str(w.axle)]
-            pull, torque, angle = (
-                np.array([np.interp(load, LOADS, column) for column in quantity]) for quantity in tables[str(w.axle)]
-            )
+            pull, torque, angle = over_slip[str(w.axle)]
             s = min(slip, float(np.interp(most_torque, torque, SLIPS)))
-            found.append(np.array([*(np.interp(s, SLIPS, q) for q in (pull, torque, angle)), s, load]))
+            found.append(np.array([*(np.interp(s, SLIPS, q) for q in (pull, torque, angle)), s, loads[str(w.axle)]]))
         return found
 
     def steady(slip: float) -> float:
@@ -330,6 +328,13 @@ def _over_load_and_slip(soil: Soil, radius: float, width: float) -> np.ndarray:
     return np.array([[wheel(soil, load, slip, radius, width)[1:] for load in LOADS] for slip in SLIPS]).transpose(
         2, 0, 1
     )
+
+
+def _at_load(table: np.ndarray, load: float) -> np.ndarray:
+    """The table over slip (3, slip) at a load [N], on straight lines between LOADS."""
+    i = int(np.clip(np.searchsorted(LOADS, load) - 1, 0, len(LOADS) - 2))
+    share = np.clip((load - LOADS[i]) / (LOADS[i + 1] - LOADS[i]), 0.0, 1.0)
+    return np.asarray((1.0 - share) * table[..., i] + share * table[..., i + 1])
 
 
 def _half_on(left: Soil, slip: float) -> tuple[float, list[dict[str, float]]]:

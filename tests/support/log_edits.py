@@ -244,44 +244,6 @@ def with_added(s: Stream, t: Array, payload: NDArray[np.uint8]) -> Stream:
     return Stream(s.message, stamps[order], np.concatenate([s.payload, payload])[order])
 
 
-def reordered(log: Log, t: float) -> Log:
-    """Each second frame changes places with the one before: the payloads come in the wrong order."""
-
-    def exchange(s: Stream, _: str, late: Since) -> Stream:
-        order, found = np.arange(len(late)), np.flatnonzero(late)
-        pairs = found[: len(found) // 2 * 2].reshape(-1, 2)
-        order[pairs] = pairs[:, ::-1]
-        return s.with_payload(s.payload[order])
-
-    return edit_of(log.streams, exchange)(log, t)
-
-
-def broken_checksums(message: str) -> Edit:
-    """The Checksum's last bit is wrong."""
-
-    def edit(s: Stream, _: str, late: Since) -> Stream:
-        payload = s.payload.copy()
-        payload[late, checkable_byte(s.message)] ^= 1
-        return s.with_payload(payload)
-
-    return edit_of([message], edit)
-
-
-def joined_by(message: str, extra: int) -> Edit:
-    """A second sender adds frames to each one: a byte differs, counters jump, the Checksum is right."""
-
-    def edit(s: Stream, _: str, late: Since) -> Stream:
-        origin = np.repeat(np.flatnonzero(late), extra)
-        payload = s.payload[origin]
-        payload[:, 0] ^= 0x10
-        other = Stream(s.message, s.t[origin] + 0.001 * (1 + np.arange(len(origin)) % extra), payload)
-        counters = np.random.default_rng(7).integers(16, size=len(origin))
-        other = other.with_codes("Counter", counters, np.ones(len(origin), np.bool_))
-        return with_added(s, other.t, other.payload)
-
-    return edit_of([message], edit)
-
-
 def both(*edits: Edit) -> Edit:
     """One after the other."""
 
