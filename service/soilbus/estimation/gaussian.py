@@ -9,7 +9,7 @@ moves the rest by its regression,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,14 +89,6 @@ class Gaussian:
         covariance[:_SOIL] = covariance[:, :_SOIL] = 0.0
         covariance[range(_SOIL), range(_SOIL)] = prior.log_std**2
         return Gaussian(prior.median, self.gains, covariance)
-
-
-class PriorQuadratic(NamedTuple):
-    """-2 log prior about a point, by F coordinates and A active gains."""
-
-    information: Array  # (F + A, F + A), half the Gauss-Newton Hessian
-    gradient: Array  # (F + A,), half the gradient
-    neg2_log_prior: float  # the value
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:
