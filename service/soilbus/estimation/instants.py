@@ -62,13 +62,11 @@ def averaged(window: Window, end: float, length: float) -> Window:
 
 def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:
     """Return sums of the known rows from each start on, over a power of their number, for columns (N,) or (N, C)."""
-    values = np.concatenate([column.reshape(len(column), column[0].size) for column in columns], axis=1)
+    flat = [column.reshape(len(column), -1) for column in columns]
+    values = np.concatenate(flat, axis=1)
     known = np.isfinite(values)
     count = np.add.reduceat(known, starts, axis=0, dtype=float)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
-    means, ends = total / np.where(count > 0.0, count, np.nan) ** power, 0
-    parts: list[Array] = []
-    for column in columns:
-        first, ends = ends, ends + column[0].size
-        parts.append(means[:, first:ends].reshape(len(means), *column.shape[1:]))
-    return parts
+    means = total / np.where(count > 0.0, count, np.nan) ** power
+    parts = np.split(means, np.cumsum([part.shape[1] for part in flat[:-1]]), axis=1)
+    return [part.reshape(len(means), *column.shape[1:]) for part, column in zip(parts, columns, strict=True)]

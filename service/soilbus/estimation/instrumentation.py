@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,7 +84,7 @@ class Observations(NamedTuple):
         return Observations(*(a[keep] for a in self))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Instrumentation:
     """What is measured of the W wheels of a rig."""
 
@@ -96,7 +96,7 @@ class Instrumentation:
     load_noise: float  # relative sd of a load that is not measured, in a bin
     motors: tuple[Group, ...] = ()  # those that drive several wheels
 
-    @property
+    @cached_property
     def latent_matrix(self) -> Array:
         """M of loads, speeds and ground speed (2 W + 1, 2 W + 1)."""
         W = len(self.load)
@@ -104,7 +104,12 @@ class Instrumentation:
         M[:W, :W], M[W : 2 * W, W : 2 * W] = matrix(self.load), matrix(self.speed)
         return M
 
-    @property
+    @cached_property
+    def from_observed(self) -> Array:
+        """The inverse of `latent_matrix`."""
+        return np.asarray(np.linalg.inv(self.latent_matrix))
+
+    @cached_property
     def loads_by_torques(self) -> NDArray[np.bool_]:
         """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
         computed, wheels = self.computes("torque"), matrix(self.load) != 0.0
@@ -114,7 +119,7 @@ class Instrumentation:
             for on, row in zip(wheels, self.load, strict=True)
         ])  # fmt: skip
 
-    @property
+    @cached_property
     def sides(self) -> tuple[tuple[int, int], ...]:
         """Row of torques and row of loads of each two wheels with equal torques and computed loads."""
         return tuple(
@@ -126,7 +131,7 @@ class Instrumentation:
             if [w != 0.0 for w in torque.weight] == [w != 0.0 for w in load.weight]
         )
 
-    @property
+    @cached_property
     def without_speed(self) -> NDArray[np.bool_]:
         """Which wheels (W,) have a speed that no channel measures, not even the mean of several."""
         free = [row for row in self.speed if row.kind == "free"]

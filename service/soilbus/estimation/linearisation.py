@@ -7,6 +7,7 @@ columns                residual | soil | sensor gains | effect parameters
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ class Layout(NamedTuple):
     effect_columns: slice
 
     @classmethod
+    @lru_cache(64)
     def of(cls, W: int, n_sensors: int) -> Layout:
         """The slices for W wheels; without columns of the sensor gains where n_sensors is 0."""
         wheels, column = slice(W), FIRST_GAIN + n_sensors

@@ -35,7 +35,6 @@ __all__ = [
     "differentiated_speed",
     "gains_of",
     "travelled",
-    "wheel_rotation",
 ]
 
 Masked = tuple[Array, Array, NDArray[np.bool_]]
@@ -136,7 +135,8 @@ class Measurements:
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
-        self.wheel_angle = wheel_rotation(self.t, self.speed)
+        turned = (self.speed[1:] + self.speed[:-1]) / 2.0 * np.diff(self.t)[:, None]
+        self.wheel_angle = np.concatenate([np.zeros((min(len(self.t), 1), n_wheels)), np.cumsum(turned, axis=0)])
         self._balance(take, usable)
         self.gain_names, gain_std = gains_of(rig)
         self.gain_std = self.sensor_std = np.array(gain_std)
@@ -183,16 +183,17 @@ class Measurements:
         """
         if self.rig.chassis is None:
             return self
-        window, values, slopes = self._curves.window, dict[str, Any](), dict[str, Array]()
+        window, values, slopes = self._curves.window, dict[str, Any](), list[Array]()
         for quantity in (*SLOPES, "torque"):
-            smooth = np.stack([curve.at(window.t)[:2] for curve in self._curves.of(quantity)], axis=2)
-            values[quantity], slopes[quantity] = smooth.reshape(2, *getattr(window, quantity).shape)
+            smooth, slope = np.stack([curve.at(window.t)[:2] for curve in self._curves.of(quantity)], axis=2)
+            values[quantity] = smooth.reshape(getattr(window, quantity).shape)
+            slopes.append(slope)
         stamped, W = copy(self), self.n_wheels
-        kept = np.searchsorted(window.t, self.t)
-        stamped._stand(standing_columns(replace(window, **values), self.rig, slopes), kept)
+        kept, of_torque = np.searchsorted(window.t, self.t), slopes.pop()
+        stamped._stand(standing_columns(replace(window, **values), self.rig, np.hstack(slopes)), kept)
         own = np.zeros((*stamped.standing_rows.shape[:2], W))
-        of_torque = np.nan_to_num(slopes["torque"])[kept, None]
-        own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque
+        matrix_of_torques = np.eye(W) if self._torque_matrix is None else self._torque_matrix
+        own[:, :W] = matrix_of_torques * np.nan_to_num(of_torque)[kept, None]
         own[~self.known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
         nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
@@ -235,7 +236,7 @@ class Measurements:
         self._sides: tuple[tuple[int, int], ...] = ()
         if given is not None:
             self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
-            self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
+            self._from_observed = given.from_observed
             computed = np.array([row.kind != "channel" for row in given.load])
             self._prior_only[: len(given.load)] = computed & ~given.loads_by_torques
             self._sides = given.sides
@@ -444,12 +445,6 @@ def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Arra
     mean = (ground_speed[1:] + ground_speed[:-1]) / 2.0
     first = ground_speed[0] * (t[0] - window[0])
     return t - window[0], np.concatenate([[0.0], np.cumsum(mean * np.diff(t))]) + first
-
-
-def wheel_rotation(t: Array, speed: Array) -> Array:
-    """Rotation [rad] (N, W) of wheels with speeds [rad/s] (N, W) since the first of times t (N,) [s]."""
-    steps = (speed[1:] + speed[:-1]) / 2.0 * np.diff(t)[:, None]
-    return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:

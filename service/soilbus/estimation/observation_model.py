@@ -73,15 +73,12 @@ class ObservationModel(Measurements):
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
         self.work = Work()
-        self.layout = Layout.of(self.n_wheels, self.n_sensors)
         self.gain_bounds = np.full((2, len(self.gain_std)), [[-np.inf], [np.inf]])
 
-    def with_own_stamps(self) -> Self:
-        """As `Measurements.with_own_stamps`; without effects."""
-        stamped = super().with_own_stamps()
-        stamped.layout = Layout.of(self.n_wheels, stamped.n_sensors)
-        stamped.gain_bounds = np.full((2, stamped.n_sensors), [[-np.inf], [np.inf]])
-        return stamped
+    @property
+    def layout(self) -> Layout:
+        """Where rows, latents, gains and columns stand."""
+        return Layout.of(self.n_wheels, self.n_sensors)
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals, their derivatives and their inverse covariance at one point, with the latents eliminated.
@@ -256,9 +253,12 @@ class ObservationModel(Measurements):
         forces, d = wheel_forces_and_derivatives(self._state(soil, latents.entry_angle, 1.0 - speed_ratio), self.model)
         forces, d = forces.reshape(3, *shape), d.reshape(3, 7, *shape)
         slope, off = d[0, 0], latents.load - forces[0]
-        load_by = self._by_slip_and_soil(d[0], soil)
-        by = np.zeros((3, 7, *shape))
-        by[0], by[1] = self._by_slip_and_soil(d[1], soil), self._by_slip_and_soil(d[2], soil)
+        given = np.empty(d.shape)  # by slip, k_c, k_phi, n, phi, c, K; d is by `wheel.INPUTS`
+        given[:, 0], given[:, 2:] = d[:, 1], d[:, 2:]
+        np.divide(d[:, 2], self.rig.width, out=given[:, 1])
+        given[:, 4] *= 1.0 + math.tan(soil.phi) ** 2
+        load_by, by = given[0], np.zeros(d.shape)
+        by[:2] = given[1:]
         by_load = np.empty((3, *shape))
         np.divide(d[1:, 0], slope, out=by_load[:2])
         np.divide(self.rig.radius * np.sin(latents.entry_angle), slope, out=by_load[2])
@@ -281,15 +281,6 @@ class ObservationModel(Measurements):
             extra_pull=np.zeros(self.n),
             extra_pull_by_effects=np.zeros((0, self.n)),
         )
-
-    def _by_slip_and_soil(self, d: Array, soil: Soil) -> Array:
-        """Derivatives (7, N, W) of one force by slip, k_c, k_phi, n, phi, c, K from those by `wheel.INPUTS`."""
-        out = np.empty(d.shape)
-        out[0] = d[1]
-        np.divide(d[2], self.rig.width, out=out[1])
-        out[2:] = d[2:]
-        out[4] *= 1.0 + np.tan(soil.phi) ** 2
-        return out
 
     def _by_observed(self, at: Response) -> Array:
         """Derivatives A (N, m, 2 W + 1) of the residuals by the observations of the latents."""
@@ -378,10 +369,6 @@ class ObservationModel(Measurements):
     def variances(self, gains: Array) -> tuple[Array, Array]:
         """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
         return self._corrected(gains)[5:]
-
-    def torques(self, soil: Array, gains: Array, latents: Latents) -> Array:
-        """Torques (N, W) [N m] of the model at a soil (6,) in SI."""
-        return np.asarray(self._response(Soil(*soil.tolist()), gains, latents).value[1])
 
     def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
         """Sinkage [m] (N, W) of the model, usable or not."""

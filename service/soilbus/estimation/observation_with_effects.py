@@ -57,6 +57,10 @@ class ObservationModelWithEffects(ObservationModel):
         super().__init__(window, rig, model, min_speed, max_turn)
         self._set_effects(effects, free)
 
+    def with_own_stamps(self) -> Self:
+        """As `Measurements.with_own_stamps`, with the same effects."""
+        return super().with_own_stamps().with_effects(self.effects, self.free)
+
     def with_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
         """The same measurements under a model with these effects alone and their free parameters."""
         other = copy(self)
@@ -69,8 +73,7 @@ class ObservationModelWithEffects(ObservationModel):
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self._sensor_std(), std])
-        bounds = np.array([f.bounds for f in self.free]).reshape(-1, 2)
-        self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
+        self.gain_bounds = np.array([(-np.inf, np.inf)] * self.n_sensors + [f.bounds for f in self.free]).T
 
     def _sensor_std(self) -> Array:
         """Prior sd of the sensors' gains; a channel that an effect delays, but a torque, has no lateness beside it."""

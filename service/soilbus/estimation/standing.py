@@ -11,7 +11,6 @@ Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -55,26 +54,25 @@ def wheel_inertia(rig: Rig) -> Array:
     return np.asarray(rig.options.standing.wheel_mass_share * mass * rig.radius**2 / 2.0)
 
 
-def standing_columns(window: Window, rig: Rig, slopes: Mapping[str, Array] | None = None) -> StandingColumns:
+def standing_columns(window: Window, rig: Rig, slopes: Array | None = None) -> StandingColumns:
     """Return the derivatives by STANDING at every bin of a completed window; 0 where a slope is not known.
 
-    slopes: by time, of each of SLOPES, in its shape; by default the differences of neighbouring bins.
+    slopes (N, 2 W + 3): by time, of the columns of SLOPES; by default the differences of neighbouring bins.
     """
     N, W, S = len(window.t), len(rig.wheels), len(STANDING)
     columns = StandingColumns(np.zeros((N, W, S)), np.zeros((N, S)), np.zeros((N, 2 * W + 1, S)))
     if N < 3 or rig.chassis is None:
         return columns
+    if slopes is None:
+        slopes = np.gradient(np.column_stack([getattr(window, q) for q in SLOPES]), window.t, axis=0)
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    (ground, draft, acceleration), speed, forward = slopes[:, 2 * W :].T, slopes[:, :W], window.ground_speed[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        if slopes is None:
-            slopes = {quantity: np.gradient(getattr(window, quantity), window.t, axis=0) for quantity in SLOPES}
-        speed, load, ground, draft, acceleration = (
-            np.where(np.isfinite(slopes[quantity]), slopes[quantity], 0.0) for quantity in SLOPES
-        )
-        forward = window.ground_speed[:, None]
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
     columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
     columns.torque[:, :, 1] = -wheel_inertia(rig) * speed
-    columns.latents[:, :W, 2] = load if all(row.kind == "channel" for row in rows_in(rig, "load")) else 0.0
+    if all(row.kind == "channel" for row in rows_in(rig, "load")):
+        columns.latents[:, :W, 2] = slopes[:, W : 2 * W]
     columns.latents[:, 2 * W, 3], columns.demand[:, 4] = ground, draft
     columns.demand[:, 5] = rig.chassis.mass * acceleration
     return columns
