@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.linearisation import DelayTerms, Latents, Response
-from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_derivatives
+from soilbus.estimation.nuisance_parameters import Free, active_at
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
@@ -92,7 +92,7 @@ class ObservationModelWithEffects(ObservationModel):
         if not self.effects:
             return super()._response(soil, gains, latents)
         standardised = gains[self.layout.effects]
-        active = active_with_derivatives(self.effects, self.free, standardised, self.n_wheels)
+        active = active_at(self.effects, self.free, standardised, self.n_wheels, derivatives=True)
         varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
         # the derivative by k_c is that by k_phi over the width
         varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
