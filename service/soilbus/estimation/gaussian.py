@@ -66,6 +66,17 @@ class Gaussian:
         share = np.linalg.solve(kept * prior + (1.0 - kept) * own, prior).T  # (k C^-1 + (1 - k) C_0^-1)^-1 C^-1
         return self._with_gains(at, kept * share @ self.gains[at], share @ own)
 
+    def wandered(self, kept: float, std: Array) -> Gaussian:
+        """Return the Gaussian after a time in which gain errors, of mean 0 and this sd (G,), keep an autocorrelation.
+
+        Stationary process (Uhlenbeck & Ornstein 1930, Phys. Rev. 36:823): a gain g is drawn back to k g with variance
+        k^2 var + (1 - k^2) std^2.
+        """
+        k = np.concatenate([np.ones(_SOIL), kept * (std > 0.0)])
+        covariance = k[:, None] * self.covariance * k
+        covariance[_SOIL:, _SOIL:] += np.diag((1.0 - k[_SOIL:] ** 2) * std**2)
+        return replace(self, gains=k[_SOIL:] * self.gains, covariance=covariance)
+
     def given(self, at: NDArray[np.intp], gains: Array) -> Gaussian:
         """Return the Gaussian where the gains at these places (K,) have these values (K,)."""
         return self._with_gains(at, gains, np.zeros((len(at), len(at))))

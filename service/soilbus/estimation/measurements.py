@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, matrix, rows_in, straightened
 from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
-from soilbus.estimation.standing import SLOPES, STANDING, StandingColumns, standing_columns, standing_std
-from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
+from soilbus.estimation.standing import SLOPES, STANDING, standing_columns, standing_std
+from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
 __all__ = [
@@ -46,8 +46,8 @@ MASS_GAIN = "load.weight"
 """Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
 _BY_INSTANT = (
-    "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
-    "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
+    "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "speed",
+    "ground_speed", "slip", "draft", "draft_var", "demand_var",
     "inertia", "inertia_var", "draft_noise", "has_balance", "pitch", "since", "distance", "wheel_angle",
     "acceleration", "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "known",
@@ -58,15 +58,9 @@ _BY_INSTANT = (
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
     """Names and prior sd of the sensor gains, then of STANDING; rows that no sensor measures have their own."""
-    names, std = [], []
-    for quantity in GAIN_QUANTITIES:
-        if quantity not in WHEEL_QUANTITIES:
-            names.append(quantity)
-            std.append(rig.noise[quantity].gain)
-        else:
-            rows = rows_in(rig, quantity)
-            names += [f"{quantity}.{row.name or f'{row.kind}{row.at}'}" for row in rows]
-            std += [row.gain for row in rows]
+    of_wheels, of_vehicle = GAIN_QUANTITIES[:3], GAIN_QUANTITIES[3:]
+    rows = [(f"{q}.{row.name or f'{row.kind}{row.at}'}", row.gain) for q in of_wheels for row in rows_in(rig, q)]
+    names, std = zip(*rows, *((q, rig.noise[q].gain) for q in of_vehicle), strict=True)
     return [*names, *STANDING], [*std, *standing_std(rig)]
 
 
@@ -122,7 +116,7 @@ class Measurements:
         self.with_sinkage = bool(self.has_sinkage.any())
         load, load_var, _ = take("load")
         speed, speed_var, _ = take("speed")
-        self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
+        self.ground_speed, ground_speed_var, _ = take("ground_speed")
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
@@ -131,22 +125,22 @@ class Measurements:
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
-        self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
         turned = (self.speed[1:] + self.speed[:-1]) / 2.0 * np.diff(self.t)[:, None]
         self.wheel_angle = np.concatenate([np.zeros((min(len(self.t), 1), n_wheels)), np.cumsum(turned, axis=0)])
-        self._balance(take, usable)
+        self._balance(take, usable, ground_speed_var)
         self.gain_names, gain_std = gains_of(rig)
         self.gain_std = self.sensor_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
         self.slip = np.where(self.rolls, rig.options.measurements.rolling_slip, slip[kept])
-        self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+        self._latents_measured = np.hstack([self.load, self.speed, self.ground_speed[:, None]])
         self.by_inertia = self.by_draft = np.zeros_like(self._latents_measured)
         if window.observations is None:
             self._measured = self._latents_measured
-            self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
+            of_wheels = np.where(np.tile(usable, 2), np.hstack([load_var, speed_var]), 0.0)
+            self._measured_var = np.hstack([of_wheels, ground_speed_var[:, None]])
         else:
             value, variance, known = masked(window.observations.value, window.observations.variance)
             self._measured = np.where(known, value, 1.0)
@@ -154,27 +148,25 @@ class Measurements:
             self._measured_var[:, self._side_columns] *= ~self._side_known
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
-        known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
-        row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
-        n_kinds = 3 if self.with_sinkage else 2
-        self.known = np.concatenate(known_rows[:n_kinds], axis=1)
+        m = 2 * n_wheels + 1 if self.with_sinkage else n_wheels + 1
+        self.known = np.hstack([self.has_torque, self.has_balance[:, None], self.has_sinkage])[:, :m]
         """Which residuals (N, m) have a measurement."""
-        self._row_var = np.where(self.known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
+        row_var = np.hstack([self.torque_var, self.demand_var[:, None], self.sinkage_var])[:, :m]
+        self._row_var = np.where(self.known, row_var, 1.0)
         self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None
         self._off_curve: Array | None = None
         self._count()
 
-    def _stand(self, columns: StandingColumns, kept: NDArray[np.intp]) -> None:
+    def _stand(self, columns: tuple[Array, Array], kept: NDArray[np.intp]) -> None:
         """Set the derivatives by STANDING of the rows (N, m, S) and of the observed latents (N, 2 W + 1, S)."""
-        torque, latents = columns.torque[kept], columns.latents[kept]
+        rows, self.standing_latents = columns[0][kept], columns[1][kept]
         if self._torque_matrix is not None and self._latent_matrix is not None:
-            torque, latents = self._torque_matrix @ torque, self._latent_matrix @ latents
-        self.standing_rows = np.zeros((*self._row_var.shape, len(STANDING)))
-        self.standing_rows[:, : self.n_wheels] = torque
-        self.standing_rows[:, self.n_wheels] = columns.demand[kept]
+            rows[:, : self.n_wheels] = self._torque_matrix @ rows[:, : self.n_wheels]
+            self.standing_latents = self._latent_matrix @ self.standing_latents
+        self.standing_rows = np.zeros((*self.known.shape, len(STANDING)))
+        self.standing_rows[:, : self.n_wheels + 1] = rows
         self.standing_rows[~self.known] = 0.0
-        self.standing_latents = latents
 
     def with_own_stamps(self) -> Self:
         """The same with each torque late by a gain of its own too, and standing parts by the slopes of smooth curves.
@@ -272,31 +264,28 @@ class Measurements:
         length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
         self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
 
-    def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
+    def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_], ground_speed_var: Array) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""
         self.draft, draft_var, known = take("draft")
-        self.with_pitch = False
-        inertia, inertia_var = np.zeros_like(self.draft), np.zeros_like(self.draft)
-        acceleration, acceleration_var = np.zeros_like(inertia), np.zeros_like(inertia)
-        self.pitch = np.zeros_like(inertia)
+        self.with_pitch, nothing = False, np.zeros_like(self.draft)
+        self.pitch = self.acceleration = self.acceleration_var = self.inertia = inertia_var = nothing
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
-            pitch, pitch_var, has_pitch = take("pitch")
+            self.pitch, pitch_var, has_pitch = take("pitch")
             self.with_pitch = bool(has_pitch.any())
             if self.rig.specific_force:  # it holds the slope: pitch is needed for dv/dt only, and its noise cancels
-                pitch_var = np.zeros_like(pitch_var)
+                pitch_var = nothing
             elif self.with_pitch:
                 known = known & has_pitch
-            acceleration, acceleration_var, has_acceleration = take("acceleration")
+            self.acceleration, self.acceleration_var, has_acceleration = take("acceleration")
             if has_acceleration.any() or self.rig.specific_force:
                 known = known & has_acceleration
             else:
-                acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
-            inertia = mass * (GRAVITY * np.sin(pitch) + acceleration)
-            inertia_var = mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
-            self.pitch = pitch
-        self.acceleration, self.acceleration_var = acceleration, acceleration_var
-        self.inertia, self.demand_var = inertia, draft_var + inertia_var
+                slope = differentiated_speed(self.t, self.ground_speed, ground_speed_var)
+                self.acceleration, self.acceleration_var = slope
+            self.inertia = mass * (GRAVITY * np.sin(self.pitch) + self.acceleration)
+            inertia_var = mass**2 * ((GRAVITY * np.cos(self.pitch)) ** 2 * pitch_var + self.acceleration_var)
+        self.demand_var = draft_var + inertia_var
         self.has_balance = known & usable.all(axis=1)
         self.draft_var, self.inertia_var = np.where(self.has_balance, [draft_var, inertia_var], 0.0)
         stepped = float((np.diff(self.draft[self.has_balance]) ** 2).sum())  # holds the noise of readings twice
@@ -328,8 +317,7 @@ class Measurements:
     @property
     def readings(self) -> Array:
         """What the sensors read in the rows of an instant (N, m): torques [N m], draft [N], sinkages [m]."""
-        parts = [self.torque, self.draft[:, None]] + ([self.sinkage] if self.with_sinkage else [])
-        return np.concatenate(parts, axis=1)
+        return np.hstack([self.torque, self.draft[:, None], self.sinkage])[:, : self._n_residuals]
 
     @property
     def wheel_torque(self) -> Array:

@@ -11,8 +11,6 @@ Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness:
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from soilbus.arrays import Array
@@ -20,7 +18,7 @@ from soilbus.estimation.instrumentation import rows_in
 from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
-__all__ = ["SLOPES", "STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
+__all__ = ["SLOPES", "STANDING", "standing_columns", "standing_std", "wheel_inertia"]
 
 STANDING = (
     "relaxation_length", "wheel_inertia", "lateness.load", "lateness.ground_speed", "lateness.draft",
@@ -29,14 +27,6 @@ STANDING = (
 """Names of the parameters, in order: [m], [1: in `wheel_inertia` units], [s]."""
 SLOPES = ("speed", "load", "ground_speed", "draft", "acceleration")
 """Quantities whose slopes by time these parts need."""
-
-
-class StandingColumns(NamedTuple):
-    """Derivatives by the parameters of STANDING (S): torques (N, W, S), demand (N, S), latents (N, 2 W + 1, S)."""
-
-    torque: Array
-    demand: Array
-    latents: Array
 
 
 def standing_std(rig: Rig) -> list[float]:
@@ -54,25 +44,25 @@ def wheel_inertia(rig: Rig) -> Array:
     return np.asarray(rig.options.standing.wheel_mass_share * mass * rig.radius**2 / 2.0)
 
 
-def standing_columns(window: Window, rig: Rig, slopes: Array | None = None) -> StandingColumns:
-    """Return the derivatives by STANDING at every bin of a completed window; 0 where a slope is not known.
+def standing_columns(window: Window, rig: Rig, slopes: Array | None = None) -> tuple[Array, Array]:
+    """Return the derivatives by STANDING (S) at every bin of a completed window; 0 where a slope is not known.
 
+    They are of the wheels' torques and the demand (N, W + 1, S), and of loads, speeds and ground speed (N, 2 W + 1, S).
     slopes (N, 2 W + 3): by time, of the columns of SLOPES; by default the differences of neighbouring bins.
     """
     N, W, S = len(window.t), len(rig.wheels), len(STANDING)
-    columns = StandingColumns(np.zeros((N, W, S)), np.zeros((N, S)), np.zeros((N, 2 * W + 1, S)))
+    rows, latents = np.zeros((N, W + 1, S)), np.zeros((N, 2 * W + 1, S))
     if N < 3 or rig.chassis is None:
-        return columns
+        return rows, latents
     if slopes is None:
         slopes = np.gradient(np.column_stack([getattr(window, q) for q in SLOPES]), window.t, axis=0)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     (ground, draft, acceleration), speed, forward = slopes[:, 2 * W :].T, slopes[:, :W], window.ground_speed[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
-    columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
-    columns.torque[:, :, 1] = -wheel_inertia(rig) * speed
+    latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
+    rows[:, :W, 1] = -wheel_inertia(rig) * speed
     if all(row.kind == "channel" for row in rows_in(rig, "load")):
-        columns.latents[:, :W, 2] = slopes[:, W : 2 * W]
-    columns.latents[:, 2 * W, 3], columns.demand[:, 4] = ground, draft
-    columns.demand[:, 5] = rig.chassis.mass * acceleration
-    return columns
+        latents[:, :W, 2] = slopes[:, W : 2 * W]
+    latents[:, 2 * W, 3], rows[:, W, 4], rows[:, W, 5] = ground, draft, rig.chassis.mass * acceleration
+    return rows, latents

@@ -28,7 +28,6 @@ from soilbus.arrays import Array
 from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.instants import averaged, instant_of
-from soilbus.estimation.last_run import passes_prior_conflict_test, prior_from_last_run
 from soilbus.estimation.model_form import form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
 from soilbus.estimation.nuisance_parameters import Free
@@ -392,15 +391,22 @@ class Tracker:
         return gaussian.drifted(self._drift(gaussian, elapsed))
 
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
-        """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
-        if self._last_run is not None:
-            last, elapsed = self._last_run
-            correlation_time = self.options.gain_correlation_time
-            joint_prior = prior_from_last_run(last, self.soil_prior, problem.gain_std, elapsed, correlation_time)
-            if passes_prior_conflict_test(problem, self.soil_prior, joint_prior):
-                return joint_prior
-            self._last_run = None
-        return Gaussian.of(self.soil_prior, problem.gain_std)
+        """Prior of the first window: with the gains of the last run where it is at least as likely as without.
+
+        A sensor exchanged or calibrated since then has another gain error.
+        """
+        without = Gaussian.of(self.soil_prior, problem.gain_std)
+        if self._last_run is None:
+            return without
+        last, elapsed = self._last_run
+        kept = math.exp(-elapsed / self.options.gain_correlation_time)
+        with_gains = last.with_prior_soil(self.soil_prior).wandered(kept, problem.gain_std)
+        fits = (fit_window(problem, self.soil_prior, prior) for prior in (without, with_gains))
+        other, fit = (fit if fit is not None and fit.converged else None for fit in fits)
+        if fit is not None and (other is None or fit.neg2_log_evidence <= other.neg2_log_evidence):
+            return with_gains
+        self._last_run = None
+        return without
 
     def _drift(self, gaussian: Gaussian, elapsed: float) -> Array:
         """Covariance (6, 6) of the drift of the soil's logarithms in `elapsed` windows."""
