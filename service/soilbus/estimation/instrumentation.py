@@ -272,15 +272,10 @@ def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
     own[:, right] += yaw[:, None] * rig.track / 2.0
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.where(own > 0.0, window.ground_speed[:, None] / own, 1.0)
-    return with_speeds(window, rig, window.speed * np.where(np.isfinite(scale), scale, 1.0))
-
-
-def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
-    """Return a completed window with other speeds (N, W) of the wheels."""
-    given, observations = rig.instrumentation, window.observations
-    if given is not None and observations is not None:
+    speed, observations = window.speed * np.where(np.isfinite(scale), scale, 1.0), window.observations
+    if rig.instrumentation is not None and observations is not None:
         W, value = len(rig.wheels), observations.value.copy()
-        value[:, W : 2 * W] = _combined(speed, matrix(given.speed))
+        value[:, W : 2 * W] = _combined(speed, matrix(rig.instrumentation.speed))
         observations = observations._replace(value=value)
     return replace(window, speed=speed, observations=observations)
 

@@ -30,7 +30,6 @@ from soilbus.terra.vehicle import GRAVITY
 __all__ = [
     "GAIN_QUANTITIES",
     "MASS_GAIN",
-    "Curves",
     "Measurements",
     "differentiated_speed",
     "gains_of",
@@ -73,13 +72,13 @@ class Measurements:
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
         self.rig, self.options = rig, rig.options
-        self._curves = Curves(completed(forward(window), rig), rig.wheels)
-        window = self._curves.window
+        self._window = window = completed(forward(window), rig)
+        self._curves: dict[str, list[Curve]] = {}
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
         straight = moving & ~in_turn
         if np.isfinite(window.yaw_rate).any():
-            window = straightened(window, rig, self._curves.of("yaw_rate")[0].at(window.t)[0])
+            window = straightened(window, rig, self.curves_of("yaw_rate")[0].at(window.t)[0])
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
@@ -175,9 +174,9 @@ class Measurements:
         """
         if self.rig.chassis is None:
             return self
-        window, values, slopes = self._curves.window, dict[str, Any](), list[Array]()
+        window, values, slopes = self._window, dict[str, Any](), list[Array]()
         for quantity in (*SLOPES, "torque"):
-            smooth, slope = np.stack([curve.at(window.t)[:2] for curve in self._curves.of(quantity)], axis=2)
+            smooth, slope = np.stack([curve.at(window.t)[:2] for curve in self.curves_of(quantity)], axis=2)
             values[quantity] = smooth.reshape(getattr(window, quantity).shape)
             slopes.append(slope)
         stamped, W = copy(self), self.n_wheels
@@ -338,25 +337,38 @@ class Measurements:
         rows = *rows_in(self.rig, "load"), *rows_in(self.rig, "speed")
         return np.array([*(row.kind == "channel" for row in rows), True])
 
+    def curves_of(self, quantity: str) -> list[Curve]:
+        """Return the smooth curves of a measured quantity: one for each wheel, or one for the vehicle."""
+        if quantity not in self._curves:
+            t, given, values = self._window.t, self._window.curves, getattr(self._window, quantity)
+            names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self.rig.wheels]
+            columns = (part.reshape(len(t), -1).T for part in (values, self._window.variance[quantity]))
+            if all(name in given for name in names):
+                self._curves[quantity] = [given[name] for name in names]
+            else:
+                pairs = [(y, var, np.isfinite(y) & np.isfinite(var)) for y, var in zip(*columns, strict=True)]
+                self._curves[quantity] = [curve_of(t[known], y[known], var[known]) for y, var, known in pairs]
+        return self._curves[quantity]
+
     def sample_time(self, quantity: str) -> float:
         """Time [s] between samples of a quantity, the longest of its channels; 0 where only bins are known."""
         names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
-        curves = self._curves.window.curves
+        curves = self._window.curves
         return max((curves[name].step for name in names if name in curves), default=0.0)
 
     def shifted(self, quantity: str, column: int, curve: Curve, delay: float) -> Array:
         """Return by how much a column of a quantity (N,) changes where a delay [s] is taken out."""
-        t = self._curves.window.t
-        values = getattr(self._curves.window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
+        t = self._window.t
+        values = getattr(self._window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
         here, kept = curve.at(self.t)[0], self._kept_noise(quantity, column, curve, delay)
         return np.asarray(curve.at(self.t + delay)[0] - here + (kept - 1.0) * (values - here))
 
     def _kept_noise(self, quantity: str, column: int, curve: Curve, delay: float) -> float:
         """Return the factor on what is beside a curve, with which a delay [s] keeps the noise of instants."""
-        of_value = self._curves.of(quantity)[column].half_width
+        of_value = self.curves_of(quantity)[column].half_width
         if not (curve.half_width and of_value and self.n > 1):
             return 1.0
-        length = float(np.median(np.diff(self._curves.window.t)))
+        length = float(np.median(np.diff(self._window.t)))
         first, end = (np.searchsorted(curve.t, self.t + part * length) for part in (-0.5, 0.5))
         n = max(round(float(np.median(end - first))), 1)
         middle = curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step
@@ -365,9 +377,9 @@ class Measurements:
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""
-        if getattr(self._curves.window, quantity).size == 0:
+        if getattr(self._window, quantity).size == 0:
             return False
-        samples = [value[np.isfinite(value)] for value in np.atleast_2d(getattr(self._curves.window, quantity).T)]
+        samples = [value[np.isfinite(value)] for value in np.atleast_2d(getattr(self._window, quantity).T)]
         off = [value - value.mean() for value in samples if len(value) > 2]
         return any(float(one[1:] @ one[:-1]) > 0.5 * float(one @ one) for one in off)
 
@@ -379,28 +391,6 @@ class Measurements:
             setattr(part, name, None if values is None else values[instants])
         part._count()
         return part
-
-
-class Curves:
-    """Smooth curves of a window's measured series, computed on first use."""
-
-    def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
-        self.window = window
-        self._wheels = wheels
-        self._cache: dict[str, list[Curve]] = {}
-
-    def of(self, quantity: str) -> list[Curve]:
-        """The curves of a quantity: one for each wheel, or one for the vehicle."""
-        if quantity not in self._cache:
-            values, variances = getattr(self.window, quantity), self.window.variance[quantity]
-            names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self._wheels]
-            if all(name in self.window.curves for name in names):
-                return self._cache.setdefault(quantity, [self.window.curves[name] for name in names])
-            shape, curves = (len(self.window.t), len(names)), self._cache.setdefault(quantity, [])
-            for value, variance in zip(values.reshape(shape).T, variances.reshape(shape).T, strict=True):
-                known = np.isfinite(value) & np.isfinite(variance)
-                curves.append(curve_of(self.window.t[known], value[known], variance[known]))
-        return self._cache[quantity]
 
 
 def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -69,7 +69,6 @@ class ObservationModelWithEffects(ObservationModel):
 
     def _set_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
         self.effects, self.free = tuple(effects), tuple(free)
-        self._named = {effect.name: effect for effect in self.effects}
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self._sensor_std(), std])
@@ -209,7 +208,7 @@ class ObservationModelWithEffects(ObservationModel):
                     continue
                 added, by = found.setdefault(quantity, self._no_delay(quantity, P))
                 d = sum(f.at(float(standardised[i])) for i, f in own)
-                for column, curve in enumerate(self._curves.of(quantity)):
+                for column, curve in enumerate(self.curves_of(quantity)):
                     added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d))
                     slope = np.nan_to_num(curve.at(self.t + d)[1])
                     for i, f in own:

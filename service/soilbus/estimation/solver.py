@@ -25,7 +25,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
-from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
+from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import at_bounds, coordinates_of, step_fraction_within
@@ -42,11 +42,6 @@ class Iterate:
     soil: Array
     gains: Array
     latents: Latents
-
-    @classmethod
-    def of(cls, optimum: Optimum) -> Iterate:
-        """Return the end point of a fit."""
-        return cls(optimum.soil, optimum.gains, optimum.latents)
 
     def as_soil(self) -> Soil:
         """Return the soil by name."""

@@ -18,8 +18,10 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -180,7 +182,7 @@ class Tracker:
         if present.problem.n_rows < self.settings.min_rows:
             self._fit = None
             return TrackerOutput(None, False, TrackerState.STEADY, present.since, *left_out, reason=Reason.TOO_FEW_DATA)
-        self._discard_before(end - self.settings.window)
+        self._posteriors = self._posteriors[max(self._newest_ended(end - self.settings.window), 0) :]
         one = self._one_soil(present)
         if not self.components.weight and not (self.settings.stated_noise and self.mismatch(one.fit)):
             present, one = self._with_components(present, window, end, one)
@@ -379,10 +381,10 @@ class Tracker:
 
     def _prior_at(self, t: float, problem: ObservationModel) -> Gaussian:
         """Posterior of the newest window that ended by t [s], plus drift since."""
-        ended = self._ended(t)
-        if not ended:
+        newest = self._newest_ended(t)
+        if newest < 0:
             return self._initial_prior(problem)
-        end, gaussian = self._posteriors[ended[-1]]
+        end, gaussian = self._posteriors[newest]
         elapsed = (t - end) / self.settings.window + 1.0  # from the middle of that window to the middle of this one
         forgotten = 1.0 / self.options.gain_memory + (t - end) / self.options.gain_correlation_time
         gaussian = gaussian.forgotten(math.exp(-forgotten), problem.gain_std)
@@ -414,13 +416,9 @@ class Tracker:
         directions = coordinates.log_directions(gaussian.soil)
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
-    def _ended(self, t: float) -> list[int]:
-        """Indices of the posteriors of windows that ended by t [s]."""
-        return [i for i, (end, _) in enumerate(self._posteriors) if end <= t + TIME_TOLERANCE]
-
-    def _discard_before(self, start: float) -> None:
-        """Discard posteriors that no window from `start` [s] on can use as prior."""
-        self._posteriors = self._posteriors[max([0, *self._ended(start)]) :]
+    def _newest_ended(self, t: float) -> int:
+        """Index of the newest posterior of a window that ended by t [s]; -1 without one."""
+        return bisect_right(self._posteriors, t + TIME_TOLERANCE, key=itemgetter(0)) - 1
 
     def _reported(self, objective: Objective, fit: Fit | None) -> Fit | None:
         """The fit as it is reported: with what the form of the contact leaves open."""
