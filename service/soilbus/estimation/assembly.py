@@ -146,17 +146,10 @@ class Motor(NamedTuple):
     max_torque: float  # [N m] at the wheel or the axle, nan where not known
 
 
-class Motors(NamedTuple):
-    """Motors of the wheels, then of the axles, then of both axles; driven (W,)."""
-
-    motors: tuple[Motor, ...]
-    driven: NDArray[np.bool_]
-
-
-def motors_of(config: Config, rig: Rig) -> Motors:
-    """Return the motors of a rig's vehicle."""
+def motors_of(config: Config, rig: Rig) -> tuple[Motor, ...]:
+    """Return the motors of a rig's vehicle: of the wheels, then of the axles, then of both axles."""
     if not rig.wheels:
-        return Motors((), np.zeros(0, bool))
+        return ()
     motors = [Motor(w.name, (i,), (1.0,), w.max_torque or math.nan) for i, w in enumerate(config.wheel)]
     ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     for axle in sorted(config.axle, key=lambda a: a.name == "both"):
@@ -167,7 +160,7 @@ def motors_of(config: Config, rig: Rig) -> Motors:
             grip, gear = grip[list(wheels)], np.array([ratio.get(str(config.wheel[i].axle), 1.0) for i in wheels])
             share = grip / float((grip / gear).sum())
         motors.append(Motor(axle.name, wheels, tuple(share.tolist()), axle.max_torque or math.nan))
-    return Motors(tuple(motors), rig.drives)
+    return tuple(motors)
 
 
 def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Rig:

@@ -159,9 +159,7 @@ class Response(NamedTuple):
 class DelayTerms(NamedTuple):
     """Measurements without delay less those taken, and their derivatives by the P effect parameters."""
 
-    torque: Array  # (N, W) [N m]
+    rows: Array  # (N, W + 1), of torques [N m] and demand [N]
     measured: Array  # (N, 2 W + 1), of the latents
-    demand: Array  # (N,) [N]
-    by_torque: Array  # (P, N, W)
-    by_measured: Array
-    by_demand: Array
+    by_rows: Array  # (P, N, W + 1)
+    by_measured: Array  # (P, N, 2 W + 1)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, matrix, rows_in, straightened
-from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
+from soilbus.estimation.local_cubics import Curve, curve_of, faithful, kept_noise
 from soilbus.estimation.standing import SLOPES, STANDING, standing_columns, standing_std
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -373,7 +373,7 @@ class Measurements:
         n = max(round(float(np.median(end - first))), 1)
         middle = curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step
         phase = round(float(np.median(self.t - middle)) / curve.step, 2)
-        return kept_noise(curve.half_width, Instants(n, phase, of_value, curve.parts), delay / curve.step)
+        return kept_noise(curve.half_width, n, phase, of_value, curve.parts, delay / curve.step)
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""

@@ -23,7 +23,6 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import solve_with_inverse
-from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.variance_components import block_sums
@@ -112,9 +111,12 @@ def form_posterior(objective: Objective, fit: Fit, farthest: Sequence[float]) ->
         gradient = columns[:, 0] + prior_by_form.T @ (of_prior @ off) - cross @ fit.last_step
         following = fit.covariance @ cross.T  # minus the derivatives of coordinates and gains by the form
         information = by_form.T @ weighed + prior_by_form.T @ of_prior @ prior_by_form - cross @ following
+        # soil and gains are eliminated from the scores (covariance by blocks: Newey & West 1987)
         scores = (by_form - optimum.at.rows @ (directions @ following)) * optimum.at.weighed[:, :1]
-        scores = scores.reshape(problem.n, -1, len(free)).sum(axis=1)
-        discount = _discount(scores, information, problem) * problem.options.posterior.form_discount
+        blocks = scores.reshape(problem.n, -1, len(free)).sum(axis=1)
+        blocks = block_sums(blocks, problem.t, problem.options.variance.block)
+        excess = float(np.trace(np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0])) / len(free)
+        discount = max(excess, 1.0) * problem.options.posterior.form_discount
         precision = 1.0 / prior_variance[free]  # of independent parameters
         found = solve_with_inverse(
             information / discount + np.diag(precision), precision * prior_mean[free] - gradient / discount
@@ -125,11 +127,3 @@ def form_posterior(objective: Objective, fit: Fit, farthest: Sequence[float]) ->
         sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ following
         mean[free], covariance[np.ix_(free, free)] = found
         return FormPosterior(sensitivity, mean, covariance)
-
-
-def _discount(scores: Array, information: Array, problem: ObservationModel) -> float:
-    """How much more scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least."""
-    # soil and gains are eliminated from the scores (covariance by blocks: Newey & West 1987)
-    blocks = block_sums(scores, problem.t, problem.options.variance.block)
-    variance = np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0]
-    return max(float(np.trace(variance)) / len(information), 1.0)

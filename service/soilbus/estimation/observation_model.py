@@ -102,16 +102,12 @@ class ObservationModel(Measurements):
 
         rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
-        residual[:, torques] = self.torque * of_torque - torque
-        residual[:, balance] = inertia + draft + at.extra_pull - at.value[0].sum(1)
-        by_soil[:, torques] = self.torque_rows(-at.by_soil[1]).transpose(1, 2, 0)
-        by_soil[:, balance] = -at.by_soil[0].sum(2).T
-        by_effects[:, torques] = self.torque_rows(-at.by_effects[1]).transpose(1, 2, 0)
-        by_effects[:, balance] = (at.extra_pull_by_effects - at.by_effects[0].sum(2)).T
+        residual[:, torques], residual[:, balance] = self.torque * of_torque, inertia + draft + at.extra_pull
         if self.with_sinkage:
-            residual[:, sinkages] = self.sinkage - at.value[2]
-            by_soil[:, sinkages] = -at.by_soil[2].transpose(1, 2, 0)
-            by_effects[:, sinkages] = -at.by_effects[2].transpose(1, 2, 0)
+            residual[:, sinkages] = self.sinkage
+        predicted, by_soil[:], by_effects[:] = map(self._rows_of, (at.value, -at.by_soil, -at.by_effects))
+        residual -= predicted
+        by_effects[:, balance] += at.extra_pull_by_effects.T
         standing = gains[self.layout.standing]
         corrected += self.standing_latents @ standing
         residual += self.standing_rows @ standing
@@ -124,13 +120,11 @@ class ObservationModel(Measurements):
             by_gain[:, :, layout.standing] = self.standing_rows + A @ self.standing_latents
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
-            late = np.zeros_like(residual)
-            late[:, torques], late[:, balance] = delay.torque * of_torque, delay.demand
-            late += (A @ (delay.measured * of_latents)[:, :, None])[:, :, 0]
+            late, of_rows = (A @ (delay.measured * of_latents)[:, :, None])[:, :, 0], np.append(of_torque, 1.0)
+            late[:, : balance + 1] += delay.rows * of_rows
             residual += np.where(self.known, late, 0.0)
             by_delay = delay.by_measured * of_latents
-            by_effects[:, torques] += (of_torque * delay.by_torque).transpose(1, 2, 0)
-            by_effects[:, balance] += delay.by_demand.T
+            by_effects[:, : balance + 1] += (delay.by_rows * of_rows).transpose(1, 2, 0)
             by_effects += np.einsum("nml,pnl->nmp", A, by_delay)
         side_load = self._side_load(A, at.value[1], now)
         corrected[:, self._side_columns] = now[:, self._side_columns]
@@ -173,6 +167,13 @@ class ObservationModel(Measurements):
             side_load=side_load,
             by_sides=by_sides,
         )
+
+    def _rows_of(self, forces: Array) -> Array:
+        """Rows (N, m, ...) of an instant by pull, torque and sinkage of the wheels (3, ..., N, W)."""
+        pull, torque, depth = forces
+        parts = [self.torque_rows(torque), pull.sum(-1, keepdims=True), depth]
+        rows = np.concatenate(parts[: 3 if self.with_sinkage else 2], axis=-1)
+        return np.asarray(rows if rows.ndim == 2 else rows.transpose(1, 2, 0))
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
         """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring; arguments as there."""
@@ -238,10 +239,7 @@ class ObservationModel(Measurements):
             return np.zeros((self.n, 0))
         ratio = latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        torque, limit = (
-            at.value[1][:, free],
-            0.05,
-        )  # in one step: the torque is curved within K over the contact's length
+        torque, limit = at.value[1][:, free], 0.05  # in one step: torque is curved within K over the contact's length
         step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
         most = self.options.measurements.max_rolling_skid
         return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
@@ -394,18 +392,13 @@ class ObservationModel(Measurements):
     def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
         """Derivatives (R, 4) of the residuals by `model_form.FORM` at an optimum, and these weighed by S^-1."""
         soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
-        layout, (n, m) = self.layout, at.by_latents.shape[:2]
+        n, m = at.by_latents.shape[:2]
         some = max(math.ceil(n / self.options.posterior.form_stride), 2)
         instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
         sparse = self._contact_by_form(soil, gains, latents, instants)
         by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
-        rows = np.zeros((n, m, len(pull)))
-        rows[:, layout.torques] = self.torque_rows(-torque).transpose(1, 2, 0)
-        rows[:, layout.balance] = -pull.sum(2).T
-        if self.with_sinkage:
-            rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
+        rows = -self._rows_of(np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1))
         self._without_sides(rows, at.by_sides)
         rows[~self.known] = 0.0
         weighed = at.inverse @ rows

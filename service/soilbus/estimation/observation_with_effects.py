@@ -223,17 +223,14 @@ class ObservationModelWithEffects(ObservationModel):
         by_measured = np.zeros((P, *measured.shape))
         measured[:, loads], measured[:, speed] = load[0] * self.usable, ground[0][:, 0]
         by_measured[:, :, loads], by_measured[:, :, speed] = load[1] * self.usable, ground[1][:, :, 0]
-        weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)
+        weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)[:, None]
         if self._latent_matrix is not None:
             measured, by_measured = measured @ self._latent_matrix.T, by_measured @ self._latent_matrix.T
-        return DelayTerms(
-            torque=self.torque_rows(torques[0]),
-            measured=measured,
-            demand=draft[0][:, 0] + weight * pitch[0][:, 0],
-            by_torque=self.torque_rows(torques[1]),
-            by_measured=by_measured,
-            by_demand=draft[1][:, :, 0] + weight * pitch[1][:, :, 0],
+        rows, by_rows = (
+            np.concatenate([self.torque_rows(torque), of_draft + weight * of_pitch], axis=-1)
+            for torque, of_draft, of_pitch in zip(torques, draft, pitch, strict=True)
         )
+        return DelayTerms(rows, measured, by_rows, by_measured)
 
     def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Zero corrections (N, columns) and derivatives (P, N, columns)."""

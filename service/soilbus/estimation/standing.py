@@ -54,11 +54,12 @@ def standing_columns(window: Window, rig: Rig, slopes: Array | None = None) -> t
     rows, latents = np.zeros((N, W + 1, S)), np.zeros((N, 2 * W + 1, S))
     if N < 3 or rig.chassis is None:
         return rows, latents
-    if slopes is None:
-        slopes = np.gradient(np.column_stack([getattr(window, q) for q in SLOPES]), window.t, axis=0)
-    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-    (ground, draft, acceleration), speed, forward = slopes[:, 2 * W :].T, slopes[:, :W], window.ground_speed[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
+        if slopes is None:
+            slopes = np.gradient(np.column_stack([getattr(window, q) for q in SLOPES]), window.t, axis=0)
+        slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        speed, forward = slopes[:, :W], window.ground_speed[:, None]
+        ground, draft, acceleration = slopes[:, 2 * W :].T
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
     latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
     rows[:, :W, 1] = -wheel_inertia(rig) * speed

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import NamedTuple
@@ -303,8 +303,7 @@ class Tracker:
         if old is None and not self.mismatch(one.fit):
             return None
         joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
-        candidates = self._candidate_transitions(change, float(window.t[0]))
-        new = self._after_transition(window, candidates, joint_prior)
+        new = self._after_transition(window, change, joint_prior)
         if new is not None and new.transition is not None:
             separated = without_transition(window, new.transition, self.rig.ahead)
             whole = present._replace(window=separated, problem=self._problem(separated))
@@ -316,12 +315,10 @@ class Tracker:
         reason = Reason.CHANGE_STATISTIC if change.statistic.is_alarm else Reason.MISMATCH
         return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self.state.transition)
 
-    def _after_transition(
-        self, window: Window, transitions: Iterable[Transition], joint_prior: Gaussian
-    ) -> _Explanation | None:
-        """The data after the first of some transitions that leaves one new soil; None where none does."""
+    def _after_transition(self, window: Window, change: ChangePoint, joint_prior: Gaussian) -> _Explanation | None:
+        """The data after the first candidate transition that leaves one new soil; None where none does."""
         prior = self._new_soil_prior
-        for transition in transitions:
+        for transition in self._candidate_transitions(change, float(window.t[0])):
             separated = without_transition(window, transition, self.rig.ahead)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
             arrived = transition.end + transition.lag if self.state.mismatch else transition.end

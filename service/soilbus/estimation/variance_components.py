@@ -111,5 +111,6 @@ def corrections(problem: ObservationModel, at: Linearisation, gains: Array) -> t
 
 def block_sums(values: Array, t: Array, block: float) -> Array:
     """Return sums (B, C) of values (N, C) at times t (N,) [s] over blocks of this length [s]."""
-    number = np.floor(t / block).astype(np.intp)
-    return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(number, prepend=number[0] - 1)), axis=0))
+    number = np.floor(t / block)
+    starts = np.flatnonzero(number[1:] != number[:-1]) + 1
+    return np.asarray(np.add.reduceat(values, np.concatenate([[0], starts]), axis=0))
