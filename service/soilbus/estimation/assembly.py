@@ -175,12 +175,13 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
     }
     axle_ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
-    groups: dict[str, list[Group]] = {}
-    for quantity in ("torque", "speed", "load"):
-        groups[quantity] = [
+    groups = {
+        quantity: [
             Group(tuple(place[w.name] for w in same), (1.0 / len(same),) * len(same), same[0].name)
             for same in config.same_signal(quantity)
         ]
+        for quantity in ("torque", "speed", "load")
+    }
     for a in config.axle:
         wheels = tuple(i for i in of_axle[a.name] if rig.drives[i])
         shaft = ratio[list(wheels)] if a.name == "both" else np.ones(len(wheels))

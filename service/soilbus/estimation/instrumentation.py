@@ -225,16 +225,13 @@ def completed(window: Window, rig: Rig) -> Window:
         np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
         *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
     )
-    columns: dict[str, Any] = {
-        "torque": torque,
-        "load": _combined(load_read, inverse(given.load)),
-        "speed": _combined(speed_of, inverse(given.speed)),
-    }
-    variance = dict(window.variance)
-    for quantity, rows, of_rows in (
-        ("load", given.load, load_var), ("speed", given.speed, speed_var), ("torque", given.torque, torque_var),
+    columns, variance = dict[str, Any](), dict(window.variance)
+    for quantity, rows, read, of_rows in (
+        ("load", given.load, load_read, load_var), ("speed", given.speed, speed_of, speed_var),
+        ("torque", given.torque, torque_read, torque_var),
     ):  # fmt: skip
         known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
+        columns[quantity] = _combined(read, inverse(rows))
         variance[quantity] = _combined(known, inverse(rows) ** 2)
     return replace(window, variance=variance, observations=observations, **columns)
 

@@ -85,7 +85,7 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
         end = _best_end(thin)
         if end is None:
             return None
-        start = objective.start(end.previous.soil, gains=end.previous.gains)
+        start = objective.start(end.previous.soil, end.previous.gains)
         descent = options.cold
         if not end.value < options.implausible * options.thinned:
             descent = replace(descent, max_evaluations=options.max_implausible_evaluations)

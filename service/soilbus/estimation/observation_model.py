@@ -396,7 +396,8 @@ class ObservationModel(Measurements):
         some = max(math.ceil(n / self.options.posterior.form_stride), 2)
         instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
         sparse = self._contact_by_form(soil, gains, latents, instants)
-        by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
+        share = np.stack([np.interp(np.arange(n), instants, one) for one in np.eye(len(instants))])
+        by_form = np.einsum("fpsw,sn->fpnw", sparse, share)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         rows = -self._rows_of(np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1))
         self._without_sides(rows, at.by_sides)
@@ -431,12 +432,9 @@ class ObservationModel(Measurements):
         radius, width, length = self._geometry[:, : angle.size]
         return state_on(soil, angle.ravel(), slip.ravel(), radius, width, length)
 
-    def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
-        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).
-
-        guess: entry angles (N, W) [rad] to begin with.
-        """
-        angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
+    def start(self, soil: Soil, gains: Array | None = None) -> Latents:
+        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,)."""
+        angle = np.full((self.n, self.n_wheels), np.nan)
         latents = Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
         if self._off_curve is not None:
             latents = self._latents(self.from_observed(self._measured - self._off_curve), angle)
@@ -466,7 +464,7 @@ class ObservationModel(Measurements):
         """
         shared, old, at = self._shared(previous.t), previous.latents, previous.at
         if not shared:
-            return self.start(Soil(*previous.soil.tolist()), gains=previous.gains)
+            return self.start(Soil(*previous.soil.tolist()), previous.gains)
         load, speed, ground = self.load[shared:], self.speed[shared:], self.ground_speed[shared:]
         near = np.abs(load[:, None] - old.load).argmin(axis=1), np.arange(self.n_wheels)
         slip_change = (old.ground_speed[:, None] / old.speed)[near] - ground[:, None] / speed
@@ -505,13 +503,3 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array
         diagonal += 1e-10
         inverse = np.linalg.inv(S)
     return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
-
-
-def _interpolated(instants: NDArray[np.intp], values: Array, n: int) -> Array:
-    """Linear interpolation (..., N, W) of values (..., S, W) at S of n instants, the first and the last among them."""
-    if len(instants) == n:
-        return values
-    at = np.arange(n)
-    after = np.minimum(np.searchsorted(instants, at, side="right"), len(instants) - 1)
-    share = ((at - instants[after - 1]) / (instants[after] - instants[after - 1]))[:, None]
-    return np.asarray((1.0 - share) * values[..., after - 1, :] + share * values[..., after, :])

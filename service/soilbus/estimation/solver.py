@@ -124,18 +124,14 @@ class Objective:
             raise ValueError("the prior has no proper covariance")
         self.prior_precision = solution[1]
 
-    def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
-        """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's, with the latents as measured.
+    def start(self, soil: Array, gains: Array | None = None, latents: Latents | None = None) -> Iterate:
+        """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's.
 
-        guess (N, W): entry angles [rad] to solve them from.
+        latents: taken where they are of this window's instants; else they are as measured.
         """
         gains = self.joint_prior.gains if gains is None else gains
-        return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains))
-
-    def start_near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
-        """Return an iterate with these latents where they are of this window's instants, else as measured."""
         if latents is None or latents.load.shape != (self.problem.n, self.problem.n_wheels):
-            return self.start(soil, gains=gains)
+            latents = self.problem.start(Soil(*soil.tolist()), gains)
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
