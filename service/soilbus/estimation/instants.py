@@ -47,14 +47,14 @@ def averaged(window: Window, end: float, length: float) -> Window:
     if given is not None:
         (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
         given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)
-    direction, each = window.direction, np.diff(starts, append=len(window.t))
+    each = np.diff(starts, append=len(window.t))
     parts = int(np.median(each))
     return replace(
         window,
         t=np.add.reduceat(window.t - end, starts) / each + end,
         variance=variance,
         observations=given,
-        direction=np.sign(np.add.reduceat(direction, starts)) if len(direction) else direction,
+        direction=np.sign(np.add.reduceat(window.direction, starts)),
         curves={name: curve.averaged(length, parts) for name, curve in window.curves.items()},
         **value,  # type: ignore[arg-type]
     )

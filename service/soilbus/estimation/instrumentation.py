@@ -313,7 +313,7 @@ def _loads(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> t
     n, W, window, chassis = len(window.t), len(given.load), steady(window), rig.chassis
     load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
     if chassis is not None:
-        weight, direction = chassis.mass * GRAVITY, window.directions
+        weight, direction = chassis.mass * GRAVITY, window.direction
         pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
         static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
         upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
@@ -367,7 +367,7 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     channels = [row for row in given.load if row.kind == "channel"]
     if rig.chassis is None or not channels:
         return np.zeros(len(window.t))
-    direction = window.directions
+    direction = window.direction
     along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
     of_wheels = wheel_loads(rig.chassis, rig.ahead, direction * window.draft, *along)
     beyond = np.sum([window.load[:, row.at] - np.array(row.weight) @ of_wheels for row in channels], axis=0)

@@ -76,10 +76,6 @@ class Latents(NamedTuple):
         """Loads, speeds and ground speed (N, 2 W + 1)."""
         return np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
 
-    def part(self, instants: NDArray[np.intp] | NDArray[np.bool_]) -> Latents:
-        """The latents of the given instants, in that order."""
-        return Latents(*[own[instants] for own in self])
-
 
 @dataclass(slots=True)
 class Linearisation:

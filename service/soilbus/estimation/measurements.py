@@ -33,7 +33,6 @@ __all__ = [
     "Measurements",
     "differentiated_speed",
     "gains_of",
-    "travelled",
 ]
 
 Masked = tuple[Array, Array, NDArray[np.bool_]]
@@ -124,11 +123,12 @@ class Measurements:
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
-        self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
+        self.since, steps, ground = self.t - window.t[:1], np.diff(self.t), self.ground_speed
+        driven = [ground[:1] * self.since[:1], (ground[1:] + ground[:-1]) / 2.0 * steps]
+        turned = [0.0 * self.speed[:1], (self.speed[1:] + self.speed[:-1]) / 2.0 * steps[:, None]]
+        self.distance, self.wheel_angle = (np.cumsum(np.concatenate(part), axis=0) for part in (driven, turned))
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
-        turned = (self.speed[1:] + self.speed[:-1]) / 2.0 * np.diff(self.t)[:, None]
-        self.wheel_angle = np.concatenate([np.zeros((min(len(self.t), 1), n_wheels)), np.cumsum(turned, axis=0)])
         self._balance(take, usable, ground_speed_var)
         self.gain_names, gain_std = gains_of(rig)
         self.gain_std = self.sensor_std = np.array(gain_std)
@@ -414,15 +414,6 @@ def off_curve(t: Array, value: Array, variance: Array) -> Array:
     if noisy.any():
         off[noisy] = value[noisy] - curve_of(t[noisy], value[noisy], variance[noisy]).value
     return off
-
-
-def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:
-    """Time [s] and distance [m] (N,) of instants t (N,) since the first bin of a window at times (M,)."""
-    if not len(t):
-        return np.zeros(0), np.zeros(0)
-    mean = (ground_speed[1:] + ground_speed[:-1]) / 2.0
-    first = ground_speed[0] * (t[0] - window[0])
-    return t - window[0], np.concatenate([[0.0], np.cumsum(mean * np.diff(t))]) + first
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:
