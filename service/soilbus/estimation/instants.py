@@ -48,14 +48,13 @@ def averaged(window: Window, end: float, length: float) -> Window:
         (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
         given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)
     each = np.diff(starts, append=len(window.t))
-    parts = int(np.median(each))
     return replace(
         window,
         t=np.add.reduceat(window.t - end, starts) / each + end,
         variance=variance,
         observations=given,
         direction=np.sign(np.add.reduceat(window.direction, starts)),
-        curves={name: curve.averaged(length, parts) for name, curve in window.curves.items()},
+        curves={name: curve.averaged(length, int(np.median(each))) for name, curve in window.curves.items()},
         **value,  # type: ignore[arg-type]
     )
 

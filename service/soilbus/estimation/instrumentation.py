@@ -79,10 +79,6 @@ class Observations(NamedTuple):
     by_inertia: Array
     by_draft: Array  # as by_inertia, of the draft as measured
 
-    def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
-        """Return the observations of the given instants."""
-        return Observations(*(a[keep] for a in self))
-
 
 @dataclass(frozen=True)
 class Instrumentation:

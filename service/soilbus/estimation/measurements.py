@@ -73,7 +73,7 @@ class Measurements:
         self.rig, self.options = rig, rig.options
         self._window = window = completed(forward(window), rig)
         self._curves: dict[str, list[Curve]] = {}
-        n_wheels = len(rig.wheels)
+        self.n_wheels = n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
         straight = moving & ~in_turn
         if np.isfinite(window.yaw_rate).any():
@@ -88,7 +88,6 @@ class Measurements:
         self.turning = int(np.count_nonzero(moving & in_turn))
         self.t = window.t[kept]
         self.usable = usable = usable[kept]
-        self.n_wheels = n_wheels
 
         def masked(value: Array, variance: Array) -> Masked:
             value, variance = value[kept], variance[kept]
@@ -143,7 +142,10 @@ class Measurements:
         else:
             value, variance, known = masked(window.observations.value, window.observations.variance)
             self._measured = np.where(known, value, 1.0)
-            self._measured_var = np.where(self._of_free_wheels(), 0.0, variance)
+            assert self._latent_matrix is not None
+            others = np.ones(len(self._prior_only), bool)  # than the speeds of free wheels, which follow from V
+            others[n_wheels:-1] = ~self.rolls
+            self._measured_var = np.where(self._latent_matrix[:, others].any(axis=1), variance, 0.0)
             self._measured_var[:, self._side_columns] *= ~self._side_known
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
@@ -233,13 +235,6 @@ class Measurements:
             self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
-    def _of_free_wheels(self) -> NDArray[np.bool_]:
-        """Observations (2 W + 1,) of the speeds of free wheels alone, which follow from the ground speed."""
-        assert self._latent_matrix is not None
-        others = np.ones(len(self._prior_only), bool)
-        others[len(self.rolls) : -1] = ~self.rolls
-        return np.asarray(~self._latent_matrix[:, others].any(axis=1))
-
     def observed(self, latents: Array) -> Array:
         """Observations (N, 2 W + 1) that latents (N, 2 W + 1) of the wheels would give without noise and gain error."""
         if self._latent_matrix is None:
@@ -326,16 +321,10 @@ class Measurements:
         return np.asarray(np.linalg.solve(self._torque_matrix, self.torque.T).T)
 
     @property
-    def measured_rows(self) -> NDArray[np.bool_]:
-        """Which residuals (m,) of an instant are of a sensor, and not of how a differential shares torque."""
-        torques = [row.kind == "channel" for row in rows_in(self.rig, "torque")]
-        return np.array([*torques, *[True] * (self._n_residuals - self.n_wheels)])
-
-    @property
-    def measured_latents(self) -> NDArray[np.bool_]:
-        """Which latents (2 W + 1,) a sensor measures, and no geometry or coupling computes."""
-        rows = *rows_in(self.rig, "load"), *rows_in(self.rig, "speed")
-        return np.array([*(row.kind == "channel" for row in rows), True])
+    def is_measured(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which residuals (m,) and latents (2 W + 1,) a sensor measures; differentials and geometry give the others."""
+        torque, load, speed = ([r.kind == "channel" for r in rows_in(self.rig, q)] for q in ("torque", "load", "speed"))
+        return np.array([*torque, *[True] * (self._n_residuals - self.n_wheels)]), np.array([*load, *speed, True])
 
     def curves_of(self, quantity: str) -> list[Curve]:
         """Return the smooth curves of a measured quantity: one for each wheel, or one for the vehicle."""

@@ -75,9 +75,9 @@ def active_at(
             own_wheel[f.wheel] = 1.0
             of_effect[name] = of_effect.get(name, 0.0) + own_wheel * number
     varied = {f.effect for f in free if derivatives and f.std > 0.0}
-    return [Active(e, values[e.name]) for e in effects if e.name in varied or not _absent(e, values[e.name])]
 
+    def is_absent(effect: Effect) -> bool:
+        own = values[effect.name]
+        return all(neutral == 0.0 and not np.any(own[name]) for name, neutral in effect.neutral.items())
 
-def _absent(effect: Effect, values: dict[str, Any]) -> bool:
-    """Whether every neutral value is zero and every value is too, so that the effect has no influence."""
-    return all(neutral == 0.0 and not np.any(values[name]) for name, neutral in effect.neutral.items())
+    return [Active(e, values[e.name]) for e in effects if e.name in varied or not is_absent(e)]

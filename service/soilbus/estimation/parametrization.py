@@ -59,7 +59,8 @@ class Coordinates:
         if _K_PHI in self._column:
             K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * self.log_depth)
             soil[_K_PHI] = K_L - soil[_K_C] / self.width
-        return self.within(soil)
+        soil[free] = np.clip(soil[free], *self._bounds)
+        return soil
 
     def log_directions(self, soil: Array) -> Array:
         """Return the derivatives (6, F) of the parameters' logarithms by the coordinates."""
@@ -90,11 +91,6 @@ class Coordinates:
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
         longest = self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
-
-    def within(self, soil: Array) -> Array:
-        """Return the soil (6,) with its free parameters clipped to the bounds, in place."""
-        soil[self.free] = np.clip(soil[self.free], *self._bounds)
-        return soil
 
     def active_bounds(self, soil: Array) -> Array:
         """Return the outward directions (E, F) of the bounds that a soil (6,) is at."""

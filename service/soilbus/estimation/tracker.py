@@ -307,8 +307,11 @@ class Tracker:
         if new is not None and new.transition is not None:
             separated = without_transition(window, new.transition, self.rig.ahead)
             whole = present._replace(window=separated, problem=self._problem(separated))
-            if old is not None and not self._are_likelier(old, new.fit, self._searched(whole).fit):
-                return None
+            together = None if old is None else self._searched(whole).fit
+            if old is not None and new.fit is not None and together is not None and together.converged:
+                gain = together.neg2_log_evidence - old.neg2_log_evidence - new.fit.neg2_log_evidence
+                if gain < self.options.significance:
+                    return None
             return new._replace(found=Reason.TWO_SOILS)
         if warm is None or old is None or end >= change.t + self.options.min_to_detect * self.settings.window:
             return None
@@ -336,13 +339,6 @@ class Tracker:
         ends = [change.t + length * lag for length in self.options.transition_lengths]
         n_over = sum(end <= start for end in ends)
         return [Transition(change.t - TIME_TOLERANCE, end, lag) for end in ends[max(n_over - 1, 0) :]]
-
-    def _are_likelier(self, old: Fit, new: Fit | None, one: Fit | None) -> bool:
-        """Whether two soils have much more evidence than one, of the same data."""
-        if one is None or new is None or not one.converged:
-            return new is not None
-        gain = one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence
-        return gain >= self.options.significance
 
     def _another_soil(self, present: _Present, one: _Explanation) -> _Explanation:
         """The window as one soil, a new one where the prior of the present one conflicts with the data."""

@@ -161,12 +161,13 @@ class Window:
     def rows(self, keep: NDArray[np.intp] | slice) -> Window:
         """Return the window with the given bins only; a slice copies nothing."""
         values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
+        given = self.observations
         return replace(
             self,
             t=self.t[keep],
             variance={q: v[keep] for q, v in self.variance.items()},
             direction=self.direction[keep],
-            observations=None if self.observations is None else self.observations.rows(keep),
+            observations=given and type(given)(*[column[keep] for column in given]),
             **values,
         )
 
