@@ -29,7 +29,7 @@ __all__ = [
     "Estimate",
     "Posterior",
     "SoilPrior",
-    "pressure_by_logs",
+    "pressure_gradient",
 ]
 
 PARAMETERS = Soil._fields
@@ -95,6 +95,11 @@ class Posterior:
         relative = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))
         return {n: Estimate(v, v * r) for n, v, r in zip(PARAMETERS, self.soil, relative.tolist(), strict=True)}
 
+    def propagate(self, gradient: Array) -> float:
+        """Return the sd of a scalar with this gradient (6,) by the parameters, to first order."""
+        variance = float(self._covariance((gradient * np.asarray(self.soil))[None])[0, 0])
+        return math.sqrt(max(variance, 0.0))  # rounding may take it below zero
+
     def _covariance(self, by_logs: Array) -> Array:
         """Covariance (S, S) of scalars with these derivatives (S, 6) by the logarithms."""
         # First order, but for c: strength is linear in it, so phi follows c itself, which is log-normal, and not its
@@ -109,17 +114,19 @@ class Posterior:
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> Estimate:
         """Return the pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
-        return self._estimate(self.soil.bearing_pressure(z_ref, b_ref), pressure_by_logs(self.soil, z_ref, b_ref))
+        gradient = pressure_gradient(self.soil, z_ref, b_ref)
+        return Estimate(self.soil.bearing_pressure(z_ref, b_ref), self.propagate(gradient))
 
     def tan_phi(self) -> Estimate:
         """Return the tangent of the internal friction angle."""
         tan = math.tan(self.soil.phi)
-        return self._estimate(tan, np.array([0.0, 0.0, 0.0, (1.0 + tan**2) * self.soil.phi, 0.0, 0.0]))
+        return Estimate(tan, self.propagate(np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0])))
 
     def shear_strength(self, pressure: float) -> Estimate:
         """Return the strength c + p tan phi [Pa] below a pressure p [Pa]."""
-        (*_, phi, c, _), tan = self.soil, math.tan(self.soil.phi)
-        return self._estimate(c + pressure * tan, np.array([0.0, 0.0, 0.0, pressure * (1.0 + tan**2) * phi, c, 0.0]))
+        tan = math.tan(self.soil.phi)
+        gradient = np.array([0.0, 0.0, 0.0, pressure * (1.0 + tan**2), 1.0, 0.0])
+        return Estimate(self.soil.c + pressure * tan, self.propagate(gradient))
 
     def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
         """Return the posterior with a covariance (6, 6) of the logarithms added, as by considered parameters.
@@ -142,13 +149,8 @@ class Posterior:
         step = np.clip(logs, -prior.log_std, prior.log_std)
         return Posterior(Soil(*(np.asarray(self.soil) * np.exp(step)).tolist()), self.log_covariance)
 
-    def _estimate(self, value: float, by_logs: Array) -> Estimate:
-        """A scalar with its sd to first order, by its derivatives (6,) by the logarithms."""
-        variance = float(self._covariance(by_logs[None])[0, 0])
-        return Estimate(value, math.sqrt(max(variance, 0.0)))  # rounding may take it below zero
 
-
-def pressure_by_logs(soil: Soil, z_ref: float, b_ref: float) -> Array:
-    """Return the derivatives (6,) of `Posterior.bearing_pressure` by the parameters' logarithms."""
-    by_k_c, by_k_phi = np.array([soil.k_c / b_ref, soil.k_phi]) * z_ref**soil.n
-    return np.array([by_k_c, by_k_phi, (by_k_c + by_k_phi) * soil.n * math.log(z_ref), 0.0, 0.0, 0.0])
+def pressure_gradient(soil: Soil, z_ref: float, b_ref: float) -> Array:
+    """Return the gradient (6,) of `Posterior.bearing_pressure` by the parameters."""
+    by_k_phi, pressure = z_ref**soil.n, soil.bearing_pressure(z_ref, b_ref)
+    return np.array([by_k_phi / b_ref, by_k_phi, pressure * math.log(z_ref), 0.0, 0.0, 0.0])
