@@ -182,11 +182,10 @@ class Measurements:
             values[quantity] = smooth.reshape(getattr(window, quantity).shape)
             slopes.append(slope)
         stamped, W = copy(self), self.n_wheels
-        kept, of_torque = np.searchsorted(window.t, self.t), slopes.pop()
+        kept, of_torque = np.searchsorted(window.t, self.t), np.nan_to_num(slopes.pop())
         stamped._stand(standing_columns(replace(window, **values), self.rig, np.hstack(slopes)), kept)
         own = np.zeros((*stamped.standing_rows.shape[:2], W))
-        matrix_of_torques = np.eye(W) if self._torque_matrix is None else self._torque_matrix
-        own[:, :W] = matrix_of_torques * np.nan_to_num(of_torque)[kept, None]
+        own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque[kept, None]
         own[~self.known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
         nothing = np.zeros((*stamped.standing_latents.shape[:2], W))

@@ -106,9 +106,8 @@ class ObservationModelWithEffects(ObservationModel):
             (excess, drawbar, torque, wheels.depth), len(self.free), (self.n, self.n_wheels)
         )
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
-        pull_by_effects = np.zeros((len(self.free), self.n))
-        for i in range(len(self.free)):
-            pull_by_effects[i] = slope_of(pull, i)
+        slopes = [np.broadcast_to(slope_of(pull, i), self.n) for i in range(len(self.free))]
+        pull_by_effects = np.array(slopes).reshape(len(slopes), self.n)
         by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
         by_carried_load = by_angle[1:] / slope  # derivatives by the load through the entry angle
