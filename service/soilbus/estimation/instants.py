@@ -67,5 +67,6 @@ def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[A
     count = np.add.reduceat(known, starts, axis=0, dtype=float)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
     means = total / np.where(count > 0.0, count, np.nan) ** power
-    parts = np.split(means, np.cumsum([part.shape[1] for part in flat[:-1]]), axis=1)
+    ends = np.cumsum([part.shape[1] for part in flat]).tolist()
+    parts = (means[:, end - part.shape[1] : end] for end, part in zip(ends, flat, strict=True))
     return [part.reshape(len(means), *column.shape[1:]) for part, column in zip(parts, columns, strict=True)]

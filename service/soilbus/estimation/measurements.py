@@ -133,7 +133,7 @@ class Measurements:
         self.gain_std = self.sensor_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
         self.slip = np.where(self.rolls, rig.options.measurements.rolling_slip, slip[kept])
-        self._latents_measured = np.hstack([self.load, self.speed, self.ground_speed[:, None]])
+        self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
         self.by_inertia = self.by_draft = np.zeros_like(self._latents_measured)
         if window.observations is None:
             self._measured = self._latents_measured
@@ -150,9 +150,9 @@ class Measurements:
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
         m = 2 * n_wheels + 1 if self.with_sinkage else n_wheels + 1
-        self.known = np.hstack([self.has_torque, self.has_balance[:, None], self.has_sinkage])[:, :m]
+        self.known = np.concatenate([self.has_torque, self.has_balance[:, None], self.has_sinkage], axis=1)[:, :m]
         """Which residuals (N, m) have a measurement."""
-        row_var = np.hstack([self.torque_var, self.demand_var[:, None], self.sinkage_var])[:, :m]
+        row_var = np.concatenate([self.torque_var, self.demand_var[:, None], self.sinkage_var], axis=1)[:, :m]
         self._row_var = np.where(self.known, row_var, 1.0)
         self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None

@@ -396,7 +396,8 @@ class ObservationModel(Measurements):
         some = max(math.ceil(n / self.options.posterior.form_stride), 2)
         instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
         sparse = self._contact_by_form(soil, gains, latents, instants)
-        share = np.stack([np.interp(np.arange(n), instants, one) for one in np.eye(len(instants))])
+        place, number = np.interp(np.arange(n), instants, np.arange(len(instants))), np.arange(len(instants))[:, None]
+        share = np.maximum(1.0 - np.abs(place - number), 0.0)  # linear between the instants
         by_form = np.einsum("fpsw,sn->fpnw", sparse, share)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         rows = -self._rows_of(np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1))

@@ -15,7 +15,6 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import rows_in
-from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
 __all__ = ["SLOPES", "STANDING", "standing_columns", "standing_std", "wheel_inertia"]
@@ -31,11 +30,10 @@ SLOPES = ("speed", "load", "ground_speed", "draft", "acceleration")
 
 def standing_std(rig: Rig) -> list[float]:
     """Return the prior sd of each of STANDING; 0, held, for a test rig, whose rows are no motion."""
-    options: StandingOptions = rig.options.standing
+    given = rig.options.standing
     if rig.chassis is None:
         return [0.0] * len(STANDING)
-    late = [options.load, options.ground_speed, options.draft, options.load]
-    return [options.relaxation_length, options.wheel_inertia, *late]
+    return [given.relaxation_length, given.wheel_inertia, given.load, given.ground_speed, given.draft, given.load]
 
 
 def wheel_inertia(rig: Rig) -> Array:
