@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from soilbus.config.model import Config
 from soilbus.decision.capability import assess
-from soilbus.estimation.assembly import model_of, motors_of, rig_of
+from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.posterior import Posterior
 from soilbus.pipeline.intake import ReportedLimits
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -107,7 +107,7 @@ def test_the_largest_draft_is_that_of_brute_force(case, soil):
     driven, axles = CASES[case]
     config, true_soil = machine(driven, axles), soil_named(soil)
     rig = rig_of(config)
-    limits = ReportedLimits(motors_of(config, rig)).at(0.0)
+    limits = ReportedLimits(config, rig).at(0.0)
     assert (limits > 0.0).tolist() == [axle in driven for axle in ("front", "front", "rear", "rear")]
     able, _ = assess(Posterior(true_soil, np.zeros((6, 6))), rig, model_of(config), None, limits, MAX_SLIP, 0.5)
     assert able is not None

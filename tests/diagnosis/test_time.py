@@ -32,7 +32,7 @@ def look(record, prior):
     """Least processor time of one linearisation of the instants to be learned from, without effects."""
     problem, soil = record.training, Soil(*prior.median.tolist())
     gains = np.zeros(problem.n_sensors)
-    latents = problem.start(soil, None, gains)
+    latents = problem.start(soil, gains)
     return min(seconds_of(lambda: problem.linearise(soil, gains, latents)) for _ in range(10))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.local_cubics import Instants, curve_of, faithful, kept_noise, variance_of_one
+from soilbus.estimation.local_cubics import curve_of, faithful, kept_noise, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
@@ -97,7 +97,7 @@ def test_a_shift_along_a_curve_leaves_the_noise_of_instants_as_large_as_it_is(ha
     noise, middle = np.random.default_rng(6).standard_normal((50_000, 60)), 30.0 + (n - 1) / 2.0
     now = noise_of_instants(noise, half, n, phase, middle, parts)
     off = now - mean_value(noise, half, middle + phase, n, parts)
-    kept = kept_noise(half, Instants(n, phase, half, parts), ahead)
+    kept = kept_noise(half, n, phase, half, parts, ahead)
     shifted = kept * off + mean_value(noise, half, middle + phase + ahead, n, parts)
     assert shifted.var() == pytest.approx(now.var(), rel=0.03)
 

@@ -109,7 +109,7 @@ def test_a_shaft_drives_three_axles_by_their_grip():
     rig = rig_of(config)
     between = [c for c in rig.instrumentation.couplings if not c.of_axle]
     assert [(c.one, c.other, c.locked) for c in between] == [((0, 1), (2, 3), True), ((2, 3), (4, 5), True)]
-    (motor,) = [m for m in motors_of(config, rig).motors if m.name == "both"]
+    (motor,) = [m for m in motors_of(config, rig) if m.name == "both"]
     assert motor.share == pytest.approx(np.repeat(of_springs(0.0), 2) / 2.0 / WEIGHT)
 
 

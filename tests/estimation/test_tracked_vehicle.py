@@ -145,7 +145,7 @@ def test_residuals_by_an_effect_equal_differences(parameter):
     problem = observed(crawler(*WITH_CELLS), ObservationModelWithEffects, effects=(effect,), free=free)
     place = problem.n_sensors + [p.name for p in effect.parameters].index(key)
     gains, step = np.zeros(len(problem.gain_std)), np.eye(len(problem.gain_std))[place] * 1e-3
-    start = problem.start(LOAM, None, gains)
+    start = problem.start(LOAM, gains)
     at = problem.linearise(LOAM, gains, start)
     up, down = (problem.linearise(LOAM, g, problem.with_entry_angles(start, LOAM, g)).rows[:, 0]
                 for g in (gains + step, gains - step))  # fmt: skip

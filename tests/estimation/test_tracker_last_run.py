@@ -11,7 +11,6 @@ import pytest
 from driven_windows import errors, tracker_of, windows
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.last_run import prior_from_last_run
 from soilbus.estimation.tracker import gain_errors
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -78,7 +77,7 @@ def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
     root = 0.1 * rng.standard_normal((6 + len(GAIN_STD),) * 2) * np.concatenate([np.ones(6), GAIN_STD])[:, None]
     gaussian = Gaussian(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(len(GAIN_STD)), root @ root.T)
     for elapsed in (0.0, 60.0, GAIN_CORRELATION_TIME, 30 * GAIN_CORRELATION_TIME):
-        left = prior_from_last_run(gaussian, PRIOR, GAIN_STD, elapsed, GAIN_CORRELATION_TIME)
+        left = gaussian.with_prior_soil(PRIOR).wandered(math.exp(-elapsed / GAIN_CORRELATION_TIME), GAIN_STD)
         # simulated: dg = -g dt / T + sqrt(2 / T) std dW, whose steps over any time are known exactly
         still = math.exp(-elapsed / GAIN_CORRELATION_TIME)
         at_first = rng.multivariate_normal(gaussian.gains, gaussian.covariance[6:, 6:], 200_000, method="cholesky")
@@ -98,7 +97,7 @@ def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
 def test_a_gain_that_is_held_stays_held():
     std = np.where(np.arange(len(GAIN_STD)) % 2, GAIN_STD, 0.0)
     gaussian = Gaussian.of(PRIOR, GAIN_STD)
-    left = prior_from_last_run(replace(gaussian, gains=GAIN_STD), PRIOR, std, 0.0, GAIN_CORRELATION_TIME)
+    left = replace(gaussian, gains=GAIN_STD).wandered(1.0, std)
     assert (left.gains == std).all()
     assert (np.diag(left.covariance)[6:] == std**2).all()
 

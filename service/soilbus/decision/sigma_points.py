@@ -119,7 +119,7 @@ class SigmaPoints:
     def _changes(self, samples: Array) -> Array:
         """Values (D, ...) less the mode's, with the other side's sign changed where there is none (nan), else 0."""
         change = samples - samples[0]
-        return np.nan_to_num(np.where(np.isnan(change), -change[self.mirror], change))
+        return np.asarray(np.nan_to_num(np.where(np.isnan(change), -change[self.mirror], change)))
 
 
 def _moduli(soil: Soil, steps: Array, width: float) -> Array:

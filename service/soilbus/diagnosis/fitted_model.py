@@ -360,7 +360,7 @@ def check(
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
     objective = Objective(problem, prior, fit.mode)
     with np.errstate(all="ignore"):
-        latents = objective.start_near(fit.mode.soil, gains, near).latents
+        latents = objective.start(fit.mode.soil, gains, near).latents
         latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
         for _ in range(CHECK_ROUNDS - 1):

@@ -112,7 +112,7 @@ class JointObjective:
         if len(gains) > 1:
             gains = [np.where(self.own, of_one, np.mean(gains, axis=0)) for of_one in gains]
         return tuple(
-            part.start_near(start.soil, of_one, None if part.as_measured else start.latents)
+            part.start(start.soil, of_one, None if part.as_measured else start.latents)
             for part, start, of_one in zip(self.parts, starts, gains, strict=True)
         )
 

@@ -106,7 +106,7 @@ def _squared_distance(rival: HeldOutCheck, posterior: Gaussian, prior: SoilPrior
 def expected_posterior(drive: ObservationModelWithEffects, prior: SoilPrior, soil: Soil) -> Posterior:
     """The posterior that a drive is expected to give: prior and Fisher information at a soil, by a noise-free drive."""
     joint_prior, gains = Gaussian.of(prior, drive.gain_std), np.zeros(len(drive.gain_std))
-    at = drive.linearise(soil, gains, drive.start(soil, None, gains))
+    at = drive.linearise(soil, gains, drive.start(soil, gains))
     scale = np.concatenate([np.array(soil), np.ones(len(gains))])
     information = (scale[:, None] * at.normal[1:, 1:]) * scale
     covariance = joint_prior.covariance

@@ -146,17 +146,10 @@ class Motor(NamedTuple):
     max_torque: float  # [N m] at the wheel or the axle, nan where not known
 
 
-class Motors(NamedTuple):
-    """Motors of the wheels, then of the axles, then of both axles; driven (W,)."""
-
-    motors: tuple[Motor, ...]
-    driven: NDArray[np.bool_]
-
-
-def motors_of(config: Config, rig: Rig) -> Motors:
-    """Return the motors of a rig's vehicle."""
+def motors_of(config: Config, rig: Rig) -> tuple[Motor, ...]:
+    """Return the motors of a rig's vehicle: of the wheels, then of the axles, then of both axles."""
     if not rig.wheels:
-        return Motors((), np.zeros(0, bool))
+        return ()
     motors = [Motor(w.name, (i,), (1.0,), w.max_torque or math.nan) for i, w in enumerate(config.wheel)]
     ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     for axle in sorted(config.axle, key=lambda a: a.name == "both"):
@@ -167,7 +160,7 @@ def motors_of(config: Config, rig: Rig) -> Motors:
             grip, gear = grip[list(wheels)], np.array([ratio.get(str(config.wheel[i].axle), 1.0) for i in wheels])
             share = grip / float((grip / gear).sum())
         motors.append(Motor(axle.name, wheels, tuple(share.tolist()), axle.max_torque or math.nan))
-    return Motors(tuple(motors), rig.drives)
+    return tuple(motors)
 
 
 def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Rig:
@@ -182,12 +175,13 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
     }
     axle_ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
-    groups: dict[str, list[Group]] = {}
-    for quantity in ("torque", "speed", "load"):
-        groups[quantity] = [
+    groups = {
+        quantity: [
             Group(tuple(place[w.name] for w in same), (1.0 / len(same),) * len(same), same[0].name)
             for same in config.same_signal(quantity)
         ]
+        for quantity in ("torque", "speed", "load")
+    }
     for a in config.axle:
         wheels = tuple(i for i in of_axle[a.name] if rig.drives[i])
         shaft = ratio[list(wheels)] if a.name == "both" else np.ones(len(wheels))

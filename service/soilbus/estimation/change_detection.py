@@ -65,11 +65,11 @@ def change_statistic(
     threshold = alarm_threshold(false_alarms, n - first, max(round(float(count.mean())), 1))
     if ratio.max() <= threshold:
         return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()), threshold)
-    with_prior = objective.with_joint_prior(joint_prior)
-    directions = with_prior.directions(iterate)
+    with_prior = Objective(objective.problem, objective.coordinates.prior, joint_prior)
+    directions, jacobian = with_prior.directions(iterate.soil), with_prior.prior_jacobian(iterate.soil)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, RESIDUAL]) @ directions
     information = directions.T @ np.einsum("imk,iml->ikl", rows, weighed) @ directions
-    prior_information = with_prior.prior_at(iterate).information
+    prior_information = jacobian.T @ with_prior.prior_precision @ jacobian
     begin = int(np.argmax(log_likelihood_ratio(misfit - _explained(gradient, information + prior_information), count)))
     # One common step for all instants from there on: the predicted soil itself must not pass for another.
     unexplained = misfit[begin:].sum() - _explained(

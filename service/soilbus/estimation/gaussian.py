@@ -9,7 +9,7 @@ moves the rest by its regression,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,17 @@ class Gaussian:
         share = np.linalg.solve(kept * prior + (1.0 - kept) * own, prior).T  # (k C^-1 + (1 - k) C_0^-1)^-1 C^-1
         return self._with_gains(at, kept * share @ self.gains[at], share @ own)
 
+    def wandered(self, kept: float, std: Array) -> Gaussian:
+        """Return the Gaussian after a time in which gain errors, of mean 0 and this sd (G,), keep an autocorrelation.
+
+        Stationary process (Uhlenbeck & Ornstein 1930, Phys. Rev. 36:823): a gain g is drawn back to k g with variance
+        k^2 var + (1 - k^2) std^2.
+        """
+        k = np.concatenate([np.ones(_SOIL), kept * (std > 0.0)])
+        covariance = k[:, None] * self.covariance * k
+        covariance[_SOIL:, _SOIL:] += np.diag((1.0 - k[_SOIL:] ** 2) * std**2)
+        return replace(self, gains=k[_SOIL:] * self.gains, covariance=covariance)
+
     def given(self, at: NDArray[np.intp], gains: Array) -> Gaussian:
         """Return the Gaussian where the gains at these places (K,) have these values (K,)."""
         return self._with_gains(at, gains, np.zeros((len(at), len(at))))
@@ -89,14 +100,6 @@ class Gaussian:
         covariance[:_SOIL] = covariance[:, :_SOIL] = 0.0
         covariance[range(_SOIL), range(_SOIL)] = prior.log_std**2
         return Gaussian(prior.median, self.gains, covariance)
-
-
-class PriorQuadratic(NamedTuple):
-    """-2 log prior about a point, by F coordinates and A active gains."""
-
-    information: Array  # (F + A, F + A), half the Gauss-Newton Hessian
-    gradient: Array  # (F + A,), half the gradient
-    neg2_log_prior: float  # the value
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:

@@ -47,28 +47,26 @@ def averaged(window: Window, end: float, length: float) -> Window:
     if given is not None:
         (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
         given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)
-    direction, each = window.direction, np.diff(starts, append=len(window.t))
-    parts = int(np.median(each))
+    each = np.diff(starts, append=len(window.t))
     return replace(
         window,
         t=np.add.reduceat(window.t - end, starts) / each + end,
         variance=variance,
         observations=given,
-        direction=np.sign(np.add.reduceat(direction, starts)) if len(direction) else direction,
-        curves={name: curve.averaged(length, parts) for name, curve in window.curves.items()},
+        direction=np.sign(np.add.reduceat(window.direction, starts)),
+        curves={name: curve.averaged(length, int(np.median(each))) for name, curve in window.curves.items()},
         **value,  # type: ignore[arg-type]
     )
 
 
 def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:
     """Return sums of the known rows from each start on, over a power of their number, for columns (N,) or (N, C)."""
-    values = np.concatenate([column.reshape(len(column), column[0].size) for column in columns], axis=1)
+    flat = [column.reshape(len(column), -1) for column in columns]
+    values = np.concatenate(flat, axis=1)
     known = np.isfinite(values)
     count = np.add.reduceat(known, starts, axis=0, dtype=float)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
-    means, ends = total / np.where(count > 0.0, count, np.nan) ** power, 0
-    parts: list[Array] = []
-    for column in columns:
-        first, ends = ends, ends + column[0].size
-        parts.append(means[:, first:ends].reshape(len(means), *column.shape[1:]))
-    return parts
+    means = total / np.where(count > 0.0, count, np.nan) ** power
+    ends = np.cumsum([part.shape[1] for part in flat]).tolist()
+    parts = (means[:, end - part.shape[1] : end] for end, part in zip(ends, flat, strict=True))
+    return [part.reshape(len(means), *column.shape[1:]) for part, column in zip(parts, columns, strict=True)]

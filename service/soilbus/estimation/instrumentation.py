@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,12 +79,8 @@ class Observations(NamedTuple):
     by_inertia: Array
     by_draft: Array  # as by_inertia, of the draft as measured
 
-    def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
-        """Return the observations of the given instants."""
-        return Observations(*(a[keep] for a in self))
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Instrumentation:
     """What is measured of the W wheels of a rig."""
 
@@ -96,7 +92,7 @@ class Instrumentation:
     load_noise: float  # relative sd of a load that is not measured, in a bin
     motors: tuple[Group, ...] = ()  # those that drive several wheels
 
-    @property
+    @cached_property
     def latent_matrix(self) -> Array:
         """M of loads, speeds and ground speed (2 W + 1, 2 W + 1)."""
         W = len(self.load)
@@ -104,7 +100,12 @@ class Instrumentation:
         M[:W, :W], M[W : 2 * W, W : 2 * W] = matrix(self.load), matrix(self.speed)
         return M
 
-    @property
+    @cached_property
+    def from_observed(self) -> Array:
+        """The inverse of `latent_matrix`."""
+        return np.asarray(np.linalg.inv(self.latent_matrix))
+
+    @cached_property
     def loads_by_torques(self) -> NDArray[np.bool_]:
         """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
         computed, wheels = self.computes("torque"), matrix(self.load) != 0.0
@@ -114,7 +115,7 @@ class Instrumentation:
             for on, row in zip(wheels, self.load, strict=True)
         ])  # fmt: skip
 
-    @property
+    @cached_property
     def sides(self) -> tuple[tuple[int, int], ...]:
         """Row of torques and row of loads of each two wheels with equal torques and computed loads."""
         return tuple(
@@ -126,7 +127,7 @@ class Instrumentation:
             if [w != 0.0 for w in torque.weight] == [w != 0.0 for w in load.weight]
         )
 
-    @property
+    @cached_property
     def without_speed(self) -> NDArray[np.bool_]:
         """Which wheels (W,) have a speed that no channel measures, not even the mean of several."""
         free = [row for row in self.speed if row.kind == "free"]
@@ -220,16 +221,13 @@ def completed(window: Window, rig: Rig) -> Window:
         np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
         *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
     )
-    columns: dict[str, Any] = {
-        "torque": torque,
-        "load": _combined(load_read, inverse(given.load)),
-        "speed": _combined(speed_of, inverse(given.speed)),
-    }
-    variance = dict(window.variance)
-    for quantity, rows, of_rows in (
-        ("load", given.load, load_var), ("speed", given.speed, speed_var), ("torque", given.torque, torque_var),
+    columns, variance = dict[str, Any](), dict(window.variance)
+    for quantity, rows, read, of_rows in (
+        ("load", given.load, load_read, load_var), ("speed", given.speed, speed_of, speed_var),
+        ("torque", given.torque, torque_read, torque_var),
     ):  # fmt: skip
         known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
+        columns[quantity] = _combined(read, inverse(rows))
         variance[quantity] = _combined(known, inverse(rows) ** 2)
     return replace(window, variance=variance, observations=observations, **columns)
 
@@ -267,15 +265,10 @@ def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
     own[:, right] += yaw[:, None] * rig.track / 2.0
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.where(own > 0.0, window.ground_speed[:, None] / own, 1.0)
-    return with_speeds(window, rig, window.speed * np.where(np.isfinite(scale), scale, 1.0))
-
-
-def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
-    """Return a completed window with other speeds (N, W) of the wheels."""
-    given, observations = rig.instrumentation, window.observations
-    if given is not None and observations is not None:
+    speed, observations = window.speed * np.where(np.isfinite(scale), scale, 1.0), window.observations
+    if rig.instrumentation is not None and observations is not None:
         W, value = len(rig.wheels), observations.value.copy()
-        value[:, W : 2 * W] = _combined(speed, matrix(given.speed))
+        value[:, W : 2 * W] = _combined(speed, matrix(rig.instrumentation.speed))
         observations = observations._replace(value=value)
     return replace(window, speed=speed, observations=observations)
 
@@ -316,7 +309,7 @@ def _loads(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> t
     n, W, window, chassis = len(window.t), len(given.load), steady(window), rig.chassis
     load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
     if chassis is not None:
-        weight, direction = chassis.mass * GRAVITY, window.directions
+        weight, direction = chassis.mass * GRAVITY, window.direction
         pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
         static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
         upright = wheel_loads(chassis, rig.ahead, 0.0, 0.0, 0.0)
@@ -370,7 +363,7 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     channels = [row for row in given.load if row.kind == "channel"]
     if rig.chassis is None or not channels:
         return np.zeros(len(window.t))
-    direction = window.directions
+    direction = window.direction
     along = direction * zero_if_unknown(window.pitch), direction * zero_if_unknown(window.acceleration)
     of_wheels = wheel_loads(rig.chassis, rig.ahead, direction * window.draft, *along)
     beyond = np.sum([window.load[:, row.at] - np.array(row.weight) @ of_wheels for row in channels], axis=0)

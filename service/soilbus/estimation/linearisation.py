@@ -7,6 +7,7 @@ columns                residual | soil | sensor gains | effect parameters
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ class Layout(NamedTuple):
     effect_columns: slice
 
     @classmethod
+    @lru_cache(64)
     def of(cls, W: int, n_sensors: int) -> Layout:
         """The slices for W wheels; without columns of the sensor gains where n_sensors is 0."""
         wheels, column = slice(W), FIRST_GAIN + n_sensors
@@ -73,10 +75,6 @@ class Latents(NamedTuple):
     def joined(self) -> Array:
         """Loads, speeds and ground speed (N, 2 W + 1)."""
         return np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
-
-    def part(self, instants: NDArray[np.intp] | NDArray[np.bool_]) -> Latents:
-        """The latents of the given instants, in that order."""
-        return Latents(*[own[instants] for own in self])
 
 
 @dataclass(slots=True)
@@ -155,9 +153,7 @@ class Response(NamedTuple):
 class DelayTerms(NamedTuple):
     """Measurements without delay less those taken, and their derivatives by the P effect parameters."""
 
-    torque: Array  # (N, W) [N m]
+    rows: Array  # (N, W + 1), of torques [N m] and demand [N]
     measured: Array  # (N, 2 W + 1), of the latents
-    demand: Array  # (N,) [N]
-    by_torque: Array  # (P, N, W)
-    by_measured: Array
-    by_demand: Array
+    by_rows: Array  # (P, N, W + 1)
+    by_measured: Array  # (P, N, 2 W + 1)

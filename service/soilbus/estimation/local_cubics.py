@@ -151,27 +151,16 @@ def variance_of_one(half: int, n: int, parts: int) -> float:
     return float(((rest + value) ** 2).sum())
 
 
-class Instants(NamedTuple):
-    """Samples of an instant, steps from their middle to it, and the half width of the curve that its value is by.
-
-    parts: places of the instant, evenly spread over the samples, of which its value is the mean.
-    """
-
-    samples: int
-    phase: float
-    half: int
-    parts: int = 1
-
-
 @lru_cache(256)
-def kept_noise(half: int, instants: Instants, ahead: float) -> float:
+def kept_noise(half: int, n: int, phase: float, of_value: int, parts: int, ahead: float) -> float:
     """Return the factor c by which a shift along a curve s leaves the noise of instants y as large as it is.
 
         var(c (y - s(0)) + s(ahead)) = var(y)        ahead in steps
 
-    With 1 the curve's noise adds to that of y or cancels some of it, and some shift seems to fit better.
+    An instant, `phase` steps after the middle of n samples, has the mean of `parts` places, evenly spread over them, by
+    a curve of half width `of_value`.  With 1 the curve's noise adds to that of y or cancels some of it, and some shift
+    seems to fit better.
     """
-    n, phase, of_value, parts = instants
     reach = max(half, of_value) + n + 2 + math.ceil(abs(phase) + abs(ahead))
     rest, now = _weights(of_value, n, phase, reach, parts)
     (_, here), (_, moved) = (_weights(half, n, at, reach, parts) for at in (phase, phase + ahead))

@@ -22,20 +22,17 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import completed, matrix, rows_in, straightened
-from soilbus.estimation.local_cubics import Curve, Instants, curve_of, faithful, kept_noise
-from soilbus.estimation.standing import SLOPES, STANDING, StandingColumns, standing_columns, standing_std
-from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
+from soilbus.estimation.local_cubics import Curve, curve_of, faithful, kept_noise
+from soilbus.estimation.standing import SLOPES, STANDING, standing_columns, standing_std
+from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
 __all__ = [
     "GAIN_QUANTITIES",
     "MASS_GAIN",
-    "Curves",
     "Measurements",
     "differentiated_speed",
     "gains_of",
-    "travelled",
-    "wheel_rotation",
 ]
 
 Masked = tuple[Array, Array, NDArray[np.bool_]]
@@ -47,8 +44,8 @@ MASS_GAIN = "load.weight"
 """Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
 _BY_INSTANT = (
-    "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
-    "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
+    "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "speed",
+    "ground_speed", "slip", "draft", "draft_var", "demand_var",
     "inertia", "inertia_var", "draft_noise", "has_balance", "pitch", "since", "distance", "wheel_angle",
     "acceleration", "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "known",
@@ -59,15 +56,9 @@ _BY_INSTANT = (
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
     """Names and prior sd of the sensor gains, then of STANDING; rows that no sensor measures have their own."""
-    names, std = [], []
-    for quantity in GAIN_QUANTITIES:
-        if quantity not in WHEEL_QUANTITIES:
-            names.append(quantity)
-            std.append(rig.noise[quantity].gain)
-        else:
-            rows = rows_in(rig, quantity)
-            names += [f"{quantity}.{row.name or f'{row.kind}{row.at}'}" for row in rows]
-            std += [row.gain for row in rows]
+    of_wheels, of_vehicle = GAIN_QUANTITIES[:3], GAIN_QUANTITIES[3:]
+    rows = [(f"{q}.{row.name or f'{row.kind}{row.at}'}", row.gain) for q in of_wheels for row in rows_in(rig, q)]
+    names, std = zip(*rows, *((q, rig.noise[q].gain) for q in of_vehicle), strict=True)
     return [*names, *STANDING], [*std, *standing_std(rig)]
 
 
@@ -80,13 +71,13 @@ class Measurements:
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
         self.rig, self.options = rig, rig.options
-        self._curves = Curves(completed(forward(window), rig), rig.wheels)
-        window = self._curves.window
-        n_wheels = len(rig.wheels)
+        self._window = window = completed(forward(window), rig)
+        self._curves: dict[str, list[Curve]] = {}
+        self.n_wheels = n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
         straight = moving & ~in_turn
         if np.isfinite(window.yaw_rate).any():
-            window = straightened(window, rig, self._curves.of("yaw_rate")[0].at(window.t)[0])
+            window = straightened(window, rig, self.curves_of("yaw_rate")[0].at(window.t)[0])
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
@@ -97,7 +88,6 @@ class Measurements:
         self.turning = int(np.count_nonzero(moving & in_turn))
         self.t = window.t[kept]
         self.usable = usable = usable[kept]
-        self.n_wheels = n_wheels
 
         def masked(value: Array, variance: Array) -> Masked:
             value, variance = value[kept], variance[kept]
@@ -123,7 +113,7 @@ class Measurements:
         self.with_sinkage = bool(self.has_sinkage.any())
         load, load_var, _ = take("load")
         speed, speed_var, _ = take("speed")
-        self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
+        self.ground_speed, ground_speed_var, _ = take("ground_speed")
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
         speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
@@ -132,12 +122,13 @@ class Measurements:
         # rows of unusable wheel-instants are zero: their load [N] and slip only have to be positive
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
-        self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
-        self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
+        self.since, steps, ground = self.t - window.t[:1], np.diff(self.t), self.ground_speed
+        driven = [ground[:1] * self.since[:1], (ground[1:] + ground[:-1]) / 2.0 * steps]
+        turned = [0.0 * self.speed[:1], (self.speed[1:] + self.speed[:-1]) / 2.0 * steps[:, None]]
+        self.distance, self.wheel_angle = (np.cumsum(np.concatenate(part), axis=0) for part in (driven, turned))
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
-        self.wheel_angle = wheel_rotation(self.t, self.speed)
-        self._balance(take, usable)
+        self._balance(take, usable, ground_speed_var)
         self.gain_names, gain_std = gains_of(rig)
         self.gain_std = self.sensor_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
@@ -146,35 +137,37 @@ class Measurements:
         self.by_inertia = self.by_draft = np.zeros_like(self._latents_measured)
         if window.observations is None:
             self._measured = self._latents_measured
-            self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
+            of_wheels = np.where(np.tile(usable, 2), np.hstack([load_var, speed_var]), 0.0)
+            self._measured_var = np.hstack([of_wheels, ground_speed_var[:, None]])
         else:
             value, variance, known = masked(window.observations.value, window.observations.variance)
             self._measured = np.where(known, value, 1.0)
-            self._measured_var = np.where(self._of_free_wheels(), 0.0, variance)
+            assert self._latent_matrix is not None
+            others = np.ones(len(self._prior_only), bool)  # than the speeds of free wheels, which follow from V
+            others[n_wheels:-1] = ~self.rolls
+            self._measured_var = np.where(self._latent_matrix[:, others].any(axis=1), variance, 0.0)
             self._measured_var[:, self._side_columns] *= ~self._side_known
             self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
             self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
-        known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
-        row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
-        n_kinds = 3 if self.with_sinkage else 2
-        self.known = np.concatenate(known_rows[:n_kinds], axis=1)
+        m = 2 * n_wheels + 1 if self.with_sinkage else n_wheels + 1
+        self.known = np.concatenate([self.has_torque, self.has_balance[:, None], self.has_sinkage], axis=1)[:, :m]
         """Which residuals (N, m) have a measurement."""
-        self._row_var = np.where(self.known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
+        row_var = np.concatenate([self.torque_var, self.demand_var[:, None], self.sinkage_var], axis=1)[:, :m]
+        self._row_var = np.where(self.known, row_var, 1.0)
         self._stand(standing_columns(window, rig), kept)
         self.held_covariance: Array | None = None
         self._off_curve: Array | None = None
         self._count()
 
-    def _stand(self, columns: StandingColumns, kept: NDArray[np.intp]) -> None:
+    def _stand(self, columns: tuple[Array, Array], kept: NDArray[np.intp]) -> None:
         """Set the derivatives by STANDING of the rows (N, m, S) and of the observed latents (N, 2 W + 1, S)."""
-        torque, latents = columns.torque[kept], columns.latents[kept]
+        rows, self.standing_latents = columns[0][kept], columns[1][kept]
         if self._torque_matrix is not None and self._latent_matrix is not None:
-            torque, latents = self._torque_matrix @ torque, self._latent_matrix @ latents
-        self.standing_rows = np.zeros((*self._row_var.shape, len(STANDING)))
-        self.standing_rows[:, : self.n_wheels] = torque
-        self.standing_rows[:, self.n_wheels] = columns.demand[kept]
+            rows[:, : self.n_wheels] = self._torque_matrix @ rows[:, : self.n_wheels]
+            self.standing_latents = self._latent_matrix @ self.standing_latents
+        self.standing_rows = np.zeros((*self.known.shape, len(STANDING)))
+        self.standing_rows[:, : self.n_wheels + 1] = rows
         self.standing_rows[~self.known] = 0.0
-        self.standing_latents = latents
 
     def with_own_stamps(self) -> Self:
         """The same with each torque late by a gain of its own too, and standing parts by the slopes of smooth curves.
@@ -183,16 +176,16 @@ class Measurements:
         """
         if self.rig.chassis is None:
             return self
-        window, values, slopes = self._curves.window, dict[str, Any](), dict[str, Array]()
+        window, values, slopes = self._window, dict[str, Any](), list[Array]()
         for quantity in (*SLOPES, "torque"):
-            smooth = np.stack([curve.at(window.t)[:2] for curve in self._curves.of(quantity)], axis=2)
-            values[quantity], slopes[quantity] = smooth.reshape(2, *getattr(window, quantity).shape)
+            smooth, slope = np.stack([curve.at(window.t)[:2] for curve in self.curves_of(quantity)], axis=2)
+            values[quantity] = smooth.reshape(getattr(window, quantity).shape)
+            slopes.append(slope)
         stamped, W = copy(self), self.n_wheels
-        kept = np.searchsorted(window.t, self.t)
-        stamped._stand(standing_columns(replace(window, **values), self.rig, slopes), kept)
+        kept, of_torque = np.searchsorted(window.t, self.t), np.nan_to_num(slopes.pop())
+        stamped._stand(standing_columns(replace(window, **values), self.rig, np.hstack(slopes)), kept)
         own = np.zeros((*stamped.standing_rows.shape[:2], W))
-        of_torque = np.nan_to_num(slopes["torque"])[kept, None]
-        own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque
+        own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque[kept, None]
         own[~self.known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
         nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
@@ -251,18 +244,11 @@ class Measurements:
         self._sides: tuple[tuple[int, int], ...] = ()
         if given is not None:
             self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
-            self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
+            self._from_observed = given.from_observed
             computed = np.array([row.kind != "channel" for row in given.load])
             self._prior_only[: len(given.load)] = computed & ~given.loads_by_torques
             self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
-
-    def _of_free_wheels(self) -> NDArray[np.bool_]:
-        """Observations (2 W + 1,) of the speeds of free wheels alone, which follow from the ground speed."""
-        assert self._latent_matrix is not None
-        others = np.ones(len(self._prior_only), bool)
-        others[len(self.rolls) : -1] = ~self.rolls
-        return np.asarray(~self._latent_matrix[:, others].any(axis=1))
 
     def observed(self, latents: Array) -> Array:
         """Observations (N, 2 W + 1) that latents (N, 2 W + 1) of the wheels would give without noise and gain error."""
@@ -287,32 +273,29 @@ class Measurements:
         length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
         self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
 
-    def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
+    def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_], ground_speed_var: Array) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""
         self.draft, draft_var, known = take("draft")
-        self.with_pitch, self.pitch_noise = False, 0.0
-        inertia, inertia_var = np.zeros_like(self.draft), np.zeros_like(self.draft)
-        acceleration, acceleration_var = np.zeros_like(inertia), np.zeros_like(inertia)
-        self.pitch = np.zeros_like(inertia)
+        self.with_pitch, self.pitch_noise, nothing = False, 0.0, np.zeros_like(self.draft)
+        self.pitch = self.acceleration = self.acceleration_var = self.inertia = inertia_var = nothing
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
-            pitch, pitch_var, has_pitch = take("pitch")
+            self.pitch, pitch_var, has_pitch = take("pitch")
             self.with_pitch = bool(has_pitch.any())
             self.pitch_noise = float(pitch_var[has_pitch].mean()) if self.with_pitch else 0.0
             if self.rig.specific_force:  # it holds the slope: pitch is needed for dv/dt only, and its noise cancels
-                pitch_var = np.zeros_like(pitch_var)
+                pitch_var = nothing
             elif self.with_pitch:
                 known = known & has_pitch
-            acceleration, acceleration_var, has_acceleration = take("acceleration")
+            self.acceleration, self.acceleration_var, has_acceleration = take("acceleration")
             if has_acceleration.any() or self.rig.specific_force:
                 known = known & has_acceleration
             else:
-                acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
-            inertia = mass * (GRAVITY * np.sin(pitch) + acceleration)
-            inertia_var = mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
-            self.pitch = pitch
-        self.acceleration, self.acceleration_var = acceleration, acceleration_var
-        self.inertia, self.demand_var = inertia, draft_var + inertia_var
+                slope = differentiated_speed(self.t, self.ground_speed, ground_speed_var)
+                self.acceleration, self.acceleration_var = slope
+            self.inertia = mass * (GRAVITY * np.sin(self.pitch) + self.acceleration)
+            inertia_var = mass**2 * ((GRAVITY * np.cos(self.pitch)) ** 2 * pitch_var + self.acceleration_var)
+        self.demand_var = draft_var + inertia_var
         self.has_balance = known & usable.all(axis=1)
         self.draft_var, self.inertia_var = np.where(self.has_balance, [draft_var, inertia_var], 0.0)
         stepped = float((np.diff(self.draft[self.has_balance]) ** 2).sum())  # holds the noise of readings twice
@@ -344,8 +327,7 @@ class Measurements:
     @property
     def readings(self) -> Array:
         """What the sensors read in the rows of an instant (N, m): torques [N m], draft [N], sinkages [m]."""
-        parts = [self.torque, self.draft[:, None]] + ([self.sinkage] if self.with_sinkage else [])
-        return np.concatenate(parts, axis=1)
+        return np.hstack([self.torque, self.draft[:, None], self.sinkage])[:, : self._n_residuals]
 
     @property
     def wheel_torque(self) -> Array:
@@ -355,47 +337,54 @@ class Measurements:
         return np.asarray(np.linalg.solve(self._torque_matrix, self.torque.T).T)
 
     @property
-    def measured_rows(self) -> NDArray[np.bool_]:
-        """Which residuals (m,) of an instant are of a sensor, and not of how a differential shares torque."""
-        torques = [row.kind == "channel" for row in rows_in(self.rig, "torque")]
-        return np.array([*torques, *[True] * (self._n_residuals - self.n_wheels)])
+    def is_measured(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which residuals (m,) and latents (2 W + 1,) a sensor measures; differentials and geometry give the others."""
+        torque, load, speed = ([r.kind == "channel" for r in rows_in(self.rig, q)] for q in ("torque", "load", "speed"))
+        return np.array([*torque, *[True] * (self._n_residuals - self.n_wheels)]), np.array([*load, *speed, True])
 
-    @property
-    def measured_latents(self) -> NDArray[np.bool_]:
-        """Which latents (2 W + 1,) a sensor measures, and no geometry or coupling computes."""
-        rows = *rows_in(self.rig, "load"), *rows_in(self.rig, "speed")
-        return np.array([*(row.kind == "channel" for row in rows), True])
+    def curves_of(self, quantity: str) -> list[Curve]:
+        """Return the smooth curves of a measured quantity: one for each wheel, or one for the vehicle."""
+        if quantity not in self._curves:
+            t, given, values = self._window.t, self._window.curves, getattr(self._window, quantity)
+            names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self.rig.wheels]
+            columns = (part.reshape(len(t), -1).T for part in (values, self._window.variance[quantity]))
+            if all(name in given for name in names):
+                self._curves[quantity] = [given[name] for name in names]
+            else:
+                pairs = [(y, var, np.isfinite(y) & np.isfinite(var)) for y, var in zip(*columns, strict=True)]
+                self._curves[quantity] = [curve_of(t[known], y[known], var[known]) for y, var, known in pairs]
+        return self._curves[quantity]
 
     def sample_time(self, quantity: str) -> float:
         """Time [s] between samples of a quantity, the longest of its channels; 0 where only bins are known."""
         names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
-        curves = self._curves.window.curves
+        curves = self._window.curves
         return max((curves[name].step for name in names if name in curves), default=0.0)
 
     def shifted(self, quantity: str, column: int, curve: Curve, delay: float) -> Array:
         """Return by how much a column of a quantity (N,) changes where a delay [s] is taken out."""
-        t = self._curves.window.t
-        values = getattr(self._curves.window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
+        t = self._window.t
+        values = getattr(self._window, quantity).reshape(len(t), -1)[np.searchsorted(t, self.t), column]
         here, kept = curve.at(self.t)[0], self._kept_noise(quantity, column, curve, delay)
         return np.asarray(curve.at(self.t + delay)[0] - here + (kept - 1.0) * (values - here))
 
     def _kept_noise(self, quantity: str, column: int, curve: Curve, delay: float) -> float:
         """Return the factor on what is beside a curve, with which a delay [s] keeps the noise of instants."""
-        of_value = self._curves.of(quantity)[column].half_width
+        of_value = self.curves_of(quantity)[column].half_width
         if not (curve.half_width and of_value and self.n > 1):
             return 1.0
-        length = float(np.median(np.diff(self._curves.window.t)))
+        length = float(np.median(np.diff(self._window.t)))
         first, end = (np.searchsorted(curve.t, self.t + part * length) for part in (-0.5, 0.5))
         n = max(round(float(np.median(end - first))), 1)
         middle = curve.t[np.minimum(first, len(curve.t) - n)] + (n - 1) / 2.0 * curve.step
         phase = round(float(np.median(self.t - middle)) / curve.step, 2)
-        return kept_noise(curve.half_width, Instants(n, phase, of_value, curve.parts), delay / curve.step)
+        return kept_noise(curve.half_width, n, phase, of_value, curve.parts, delay / curve.step)
 
     def moves(self, quantity: str) -> bool:
         """Whether what a quantity varies by is mostly no noise: successive samples correlate by more than a half."""
-        if getattr(self._curves.window, quantity).size == 0:
+        if getattr(self._window, quantity).size == 0:
             return False
-        samples = [value[np.isfinite(value)] for value in np.atleast_2d(getattr(self._curves.window, quantity).T)]
+        samples = [value[np.isfinite(value)] for value in np.atleast_2d(getattr(self._window, quantity).T)]
         off = [value - value.mean() for value in samples if len(value) > 2]
         return any(float(one[1:] @ one[:-1]) > 0.5 * float(one @ one) for one in off)
 
@@ -407,28 +396,6 @@ class Measurements:
             setattr(part, name, None if values is None else values[instants])
         part._count()
         return part
-
-
-class Curves:
-    """Smooth curves of a window's measured series, computed on first use."""
-
-    def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
-        self.window = window
-        self._wheels = wheels
-        self._cache: dict[str, list[Curve]] = {}
-
-    def of(self, quantity: str) -> list[Curve]:
-        """The curves of a quantity: one for each wheel, or one for the vehicle."""
-        if quantity not in self._cache:
-            values, variances = getattr(self.window, quantity), self.window.variance[quantity]
-            names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self._wheels]
-            if all(name in self.window.curves for name in names):
-                return self._cache.setdefault(quantity, [self.window.curves[name] for name in names])
-            shape, curves = (len(self.window.t), len(names)), self._cache.setdefault(quantity, [])
-            for value, variance in zip(values.reshape(shape).T, variances.reshape(shape).T, strict=True):
-                known = np.isfinite(value) & np.isfinite(variance)
-                curves.append(curve_of(self.window.t[known], value[known], variance[known]))
-        return self._cache[quantity]
 
 
 def steady_loads(load: Array, variance: Array, tracks: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -452,21 +419,6 @@ def off_curve(t: Array, value: Array, variance: Array) -> Array:
     if noisy.any():
         off[noisy] = value[noisy] - curve_of(t[noisy], value[noisy], variance[noisy]).value
     return off
-
-
-def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:
-    """Time [s] and distance [m] (N,) of instants t (N,) since the first bin of a window at times (M,)."""
-    if not len(t):
-        return np.zeros(0), np.zeros(0)
-    mean = (ground_speed[1:] + ground_speed[:-1]) / 2.0
-    first = ground_speed[0] * (t[0] - window[0])
-    return t - window[0], np.concatenate([[0.0], np.cumsum(mean * np.diff(t))]) + first
-
-
-def wheel_rotation(t: Array, speed: Array) -> Array:
-    """Rotation [rad] (N, W) of wheels with speeds [rad/s] (N, W) since the first of times t (N,) [s]."""
-    steps = (speed[1:] + speed[:-1]) / 2.0 * np.diff(t)[:, None]
-    return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array) -> tuple[Array, Array]:

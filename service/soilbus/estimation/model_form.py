@@ -23,9 +23,8 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import solve_with_inverse
-from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
-from soilbus.estimation.solver import Iterate, Objective
+from soilbus.estimation.solver import Objective
 from soilbus.estimation.variance_components import block_sums
 from soilbus.terra.wheel import WheelModel
 
@@ -46,15 +45,6 @@ published wheel."""
 _SOIL = len(PARAMETERS)
 
 
-def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
-    """Return the mean (4,) and covariance (4, 4) of the form parameters before any data.
-
-    farthest: how far each of FORM may be from the configured form, whose value is 0; none is negative.
-    """
-    reach = np.asarray(farthest)
-    return SIDE * reach / 2.0, np.diag(OF_SQUARE * reach**2)
-
-
 @dataclass(frozen=True, slots=True)
 class FormPosterior:
     """The form parameters after a window, 0 being the configured form, and how soil and gains depend on them."""
@@ -62,11 +52,6 @@ class FormPosterior:
     by_form: Array  # (6 + G, 4), derivatives of the soil's logarithms and of the gains by FORM
     mean: Array  # (4,) of the form parameters
     covariance: Array  # (4, 4)
-
-    @classmethod
-    def of(cls, farthest: Sequence[float], n_gains: int) -> FormPosterior:
-        """Return the form parameters before any data: the prior (`form_prior`)."""
-        return cls(np.zeros((_SOIL + n_gains, len(FORM))), *form_prior(farthest))
 
     @property
     def centre(self) -> Array:
@@ -107,46 +92,38 @@ def with_form_step(model: WheelModel, step: Array) -> WheelModel:
     )
 
 
-def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> FormPosterior:
+def form_posterior(objective: Objective, fit: Fit, farthest: Sequence[float]) -> FormPosterior:
     """Return the posterior of the form parameters after a window's fit on the configured form.
 
-    The prior itself where every form parameter is held or the normal equations are singular.
+    farthest: how far each of FORM may be from the configured form; none is negative, one is not 0.  The prior where the
+    normal equations are singular.
     """
-    problem, optimum = objective.problem, fit.optimum
-    free = np.flatnonzero(np.diag(prior.covariance) > 0.0)
-    if not len(free):
-        return prior
-    by_form, weighed = problem.by_form(optimum)
-    by_form, weighed = by_form[:, free], weighed[:, free]
-    prior_by_form, of_prior = -prior.by_form[np.ix_(objective.unknowns, free)], objective.prior_precision
-    off = objective.prior_residuals(optimum.soil, optimum.gains)
-    columns = weighed.T @ optimum.at.rows
-    directions = objective.directions(Iterate.of(optimum))
-    cross = columns @ directions + prior_by_form.T @ of_prior @ objective.prior_jacobian(optimum.soil)
-    gradient = columns[:, 0] + prior_by_form.T @ (of_prior @ off)
-    information = by_form.T @ weighed + prior_by_form.T @ of_prior @ prior_by_form
-    precision = 1.0 / np.diag(prior.covariance)[free]  # of independent parameters
-    following = fit.covariance @ cross.T  # minus the derivatives of coordinates and gains by the form
-    information = information - cross @ following
-    of_gradient = cross @ fit.last_step
-    scores = ((by_form - optimum.at.rows @ directions @ following) * optimum.at.weighed[:, :1]).reshape(
-        problem.n, -1, len(free)
-    )
-    discount = _discount(scores.sum(axis=1), information, problem) * problem.options.posterior.form_discount
-    found = solve_with_inverse(
-        information / discount + np.diag(precision), precision * prior.mean[free] + (of_gradient - gradient) / discount
-    )
-    if found is None:
-        return prior
-    sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
-    sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ following
-    mean[free], covariance[np.ix_(free, free)] = found
-    return FormPosterior(sensitivity, mean, covariance)
-
-
-def _discount(scores: Array, information: Array, problem: ObservationModel) -> float:
-    """How much more scores (N, P) of seconds vary than the information (P, P) of the form says; 1 at least."""
-    # soil and gains are eliminated from the scores (covariance by blocks: Newey & West 1987)
-    blocks = block_sums(scores, problem.t, problem.options.variance.block)
-    variance = np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0]
-    return max(float(np.trace(variance)) / len(information), 1.0)
+    problem, optimum, carried = objective.problem, fit.optimum, objective.joint_prior.form
+    prior_mean, prior_variance = SIDE * np.asarray(farthest) / 2.0, OF_SQUARE * np.square(farthest)
+    by_prior = np.zeros((_SOIL + len(fit.gains), len(FORM))) if carried is None else carried.by_form
+    free = np.flatnonzero(prior_variance)
+    with np.errstate(all="ignore"):
+        by_form, weighed = (part[:, free] for part in problem.by_form(optimum))
+        prior_by_form, of_prior = -by_prior[np.ix_(objective.unknowns, free)], objective.prior_precision
+        off, directions = objective.prior_residuals(optimum.soil, optimum.gains), objective.directions(optimum.soil)
+        columns = weighed.T @ optimum.at.rows
+        cross = columns @ directions + prior_by_form.T @ of_prior @ objective.prior_jacobian(optimum.soil)
+        gradient = columns[:, 0] + prior_by_form.T @ (of_prior @ off) - cross @ fit.last_step
+        following = fit.covariance @ cross.T  # minus the derivatives of coordinates and gains by the form
+        information = by_form.T @ weighed + prior_by_form.T @ of_prior @ prior_by_form - cross @ following
+        # soil and gains are eliminated from the scores (covariance by blocks: Newey & West 1987)
+        scores = (by_form - optimum.at.rows @ (directions @ following)) * optimum.at.weighed[:, :1]
+        blocks = scores.reshape(problem.n, -1, len(free)).sum(axis=1)
+        blocks = block_sums(blocks, problem.t, problem.options.variance.block)
+        excess = float(np.trace(np.linalg.lstsq(information, blocks.T @ blocks, rcond=None)[0])) / len(free)
+        discount = max(excess, 1.0) * problem.options.posterior.form_discount
+        precision = 1.0 / prior_variance[free]  # of independent parameters
+        found = solve_with_inverse(
+            information / discount + np.diag(precision), precision * prior_mean[free] - gradient / discount
+        )
+        if found is None:
+            return FormPosterior(by_prior, prior_mean, np.diag(prior_variance))
+        sensitivity, mean, covariance = np.zeros_like(by_prior), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
+        sensitivity[:, free] = -objective.parameter_jacobian(optimum.soil) @ following
+        mean[free], covariance[np.ix_(free, free)] = found
+        return FormPosterior(sensitivity, mean, covariance)

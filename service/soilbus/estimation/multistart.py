@@ -85,7 +85,7 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussia
         end = _best_end(thin)
         if end is None:
             return None
-        start = objective.start(end.previous.soil, gains=end.previous.gains)
+        start = objective.start(end.previous.soil, end.previous.gains)
         descent = options.cold
         if not end.value < options.implausible * options.thinned:
             descent = replace(descent, max_evaluations=options.max_implausible_evaluations)
@@ -160,15 +160,15 @@ def fit_at(objective: Objective, end: Solution[Iterate, WindowModel], evaluation
     """Return the fit at the end of a descent, after evaluations of the model before it; None where it is not finite."""
     if end.model is None:
         return None
-    inverse = solve_with_inverse(end.model.information, end.model.gradient)
-    if inverse is None:
+    solution = solve_with_inverse(end.model.information, end.model.gradient)
+    if solution is None:
         return None
     is_converged, previous = end.termination is Termination.STEP, end.previous
     last_decrease = end.predicted_decrease if is_converged else 0.0
     return Fit(
-        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, inverse[1]),
-        last_step=inverse[0],
-        covariance=inverse[1],
+        mode=objective.gaussian(end.iterate.soil, end.iterate.gains, solution[1]),
+        last_step=solution[0],
+        covariance=solution[1],
         sinkage=objective.problem.mean_sinkage(end.iterate.as_soil(), end.iterate.gains, end.iterate.latents),
         optimum=Optimum(objective.problem.t, previous.soil, previous.gains, previous.latents, end.model.linearisation),
         neg2_log_posterior=end.model.neg2_log_posterior - last_decrease,

@@ -3,7 +3,7 @@
     u = (value - prior value) / prior sd,    u ~ N(0, 1) before any data
 
 A fit works with the standardised u of each free parameter.  `active_at` turns standardised values into
-effects with values; `active_with_derivatives` does so with derivatives by each u.
+effects with values, and with derivatives by each u where asked.
 """
 
 from __future__ import annotations
@@ -57,30 +57,16 @@ def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
     return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
 
 
-def active_at(effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int) -> list[Active]:
-    """Return the effects that have an influence at standardised parameters (P,), with their values, float or (W,)."""
-    values = _values(effects, free, [f.at(u) for f, u in zip(free, standardised.tolist(), strict=True)], n_wheels)
-    return [Active(e, values[e.name]) for e in effects if not _absent(e, values[e.name])]
-
-
-def active_with_derivatives(
-    effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int
+def active_at(
+    effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int, derivatives: bool = False
 ) -> list[Active]:
-    """Return the effects as `active_at`, with derivatives by the standardised parameters (as Duals)."""
-    numbers = [
-        Dual(f.at(u), {i: f.std}) if f.std > 0.0 else f.at(u)
-        for i, (f, u) in enumerate(zip(free, standardised.tolist(), strict=True))
-    ]
-    values, varied = _values(effects, free, numbers, n_wheels), {f.effect for f in free if f.std > 0.0}
-    return [Active(e, values[e.name]) for e in effects if e.name in varied or not _absent(e, values[e.name])]
+    """Return the effects that have an influence at standardised parameters (P,), with their values, float or (W,).
 
-
-def _values(
-    effects: Sequence[Effect], free: Sequence[Free], numbers: Sequence[Any], n_wheels: int
-) -> dict[str, dict[str, Any]]:
-    """Values by effect and parameter; (W,) where each wheel has its own."""
+    derivatives: values that vary are Duals, with derivatives by the standardised parameters.
+    """
     values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
-    for f, number in zip(free, numbers, strict=True):
+    for i, (f, u) in enumerate(zip(free, standardised.tolist(), strict=True)):
+        number = Dual(f.at(u), {i: f.std}) if derivatives and f.std > 0.0 else f.at(u)
         of_effect, name = values[f.effect], f.parameter.name
         if f.wheel is None:
             of_effect[name] = number
@@ -88,9 +74,10 @@ def _values(
             own_wheel = np.zeros(n_wheels)
             own_wheel[f.wheel] = 1.0
             of_effect[name] = of_effect.get(name, 0.0) + own_wheel * number
-    return values
+    varied = {f.effect for f in free if derivatives and f.std > 0.0}
 
+    def is_absent(effect: Effect) -> bool:
+        own = values[effect.name]
+        return all(neutral == 0.0 and not np.any(own[name]) for name, neutral in effect.neutral.items())
 
-def _absent(effect: Effect, values: dict[str, Any]) -> bool:
-    """Whether every neutral value is zero and every value is too, so that the effect has no influence."""
-    return all(neutral == 0.0 and not np.any(values[name]) for name, neutral in effect.neutral.items())
+    return [Active(e, values[e.name]) for e in effects if e.name in varied or not is_absent(e)]

@@ -73,15 +73,12 @@ class ObservationModel(Measurements):
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
         self.work = Work()
-        self.layout = Layout.of(self.n_wheels, self.n_sensors)
         self.gain_bounds = np.full((2, len(self.gain_std)), [[-np.inf], [np.inf]])
 
-    def with_own_stamps(self) -> Self:
-        """As `Measurements.with_own_stamps`; without effects."""
-        stamped = super().with_own_stamps()
-        stamped.layout = Layout.of(self.n_wheels, stamped.n_sensors)
-        stamped.gain_bounds = np.full((2, stamped.n_sensors), [[-np.inf], [np.inf]])
-        return stamped
+    @property
+    def layout(self) -> Layout:
+        """Where rows, latents, gains and columns stand."""
+        return Layout.of(self.n_wheels, self.n_sensors)
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals, their derivatives and their inverse covariance at one point, with the latents eliminated.
@@ -105,17 +102,13 @@ class ObservationModel(Measurements):
 
         rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
-        residual[:, torques] = self.torque * of_torque - torque
         extra, extra_by_effects = self.extra_pull(gains, latents)
-        residual[:, balance] = inertia + draft + extra - at.value[0].sum(1)
-        by_soil[:, torques] = self.torque_rows(-at.by_soil[1]).transpose(1, 2, 0)
-        by_soil[:, balance] = -at.by_soil[0].sum(2).T
-        by_effects[:, torques] = self.torque_rows(-at.by_effects[1]).transpose(1, 2, 0)
-        by_effects[:, balance] = (extra_by_effects - at.by_effects[0].sum(2)).T
+        residual[:, torques], residual[:, balance] = self.torque * of_torque, inertia + draft + extra
         if self.with_sinkage:
-            residual[:, sinkages] = self.sinkage - at.value[2]
-            by_soil[:, sinkages] = -at.by_soil[2].transpose(1, 2, 0)
-            by_effects[:, sinkages] = -at.by_effects[2].transpose(1, 2, 0)
+            residual[:, sinkages] = self.sinkage
+        predicted, by_soil[:], by_effects[:] = map(self._rows_of, (at.value, -at.by_soil, -at.by_effects))
+        residual -= predicted
+        by_effects[:, balance] += extra_by_effects.T
         standing = gains[self.layout.standing]
         corrected += self.standing_latents @ standing
         residual += self.standing_rows @ standing
@@ -128,13 +121,11 @@ class ObservationModel(Measurements):
             by_gain[:, :, layout.standing] = self.standing_rows + A @ self.standing_latents
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
-            late = np.zeros_like(residual)
-            late[:, torques], late[:, balance] = delay.torque * of_torque, delay.demand
-            late += (A @ (delay.measured * of_latents)[:, :, None])[:, :, 0]
+            late, of_rows = (A @ (delay.measured * of_latents)[:, :, None])[:, :, 0], np.append(of_torque, 1.0)
+            late[:, : balance + 1] += delay.rows * of_rows
             residual += np.where(self.known, late, 0.0)
             by_delay = delay.by_measured * of_latents
-            by_effects[:, torques] += (of_torque * delay.by_torque).transpose(1, 2, 0)
-            by_effects[:, balance] += delay.by_demand.T
+            by_effects[:, : balance + 1] += (delay.by_rows * of_rows).transpose(1, 2, 0)
             by_effects += np.einsum("nml,pnl->nmp", A, by_delay)
         side_load = self._side_load(A, at.value[1], now)
         corrected[:, self._side_columns] = now[:, self._side_columns]
@@ -179,6 +170,13 @@ class ObservationModel(Measurements):
             side_load=side_load,
             by_sides=by_sides,
         )
+
+    def _rows_of(self, forces: Array) -> Array:
+        """Rows (N, m, ...) of an instant by pull, torque and sinkage of the wheels (3, ..., N, W)."""
+        pull, torque, depth = forces
+        parts = [self.torque_rows(torque), pull.sum(-1, keepdims=True), depth]
+        rows = np.concatenate(parts[: 3 if self.with_sinkage else 2], axis=-1)
+        return np.asarray(rows if rows.ndim == 2 else rows.transpose(1, 2, 0))
 
     def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
         """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring; arguments as there."""
@@ -251,10 +249,7 @@ class ObservationModel(Measurements):
             return np.zeros((self.n, 0))
         ratio = latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])  # 1 - slip
         by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
-        torque, limit = (
-            at.value[1][:, free],
-            0.05,
-        )  # in one step: the torque is curved within K over the contact's length
+        torque, limit = at.value[1][:, free], 0.05  # in one step: torque is curved within K over the contact's length
         step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
         most = self.options.measurements.max_rolling_skid
         return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
@@ -266,9 +261,12 @@ class ObservationModel(Measurements):
         forces, d = wheel_forces_and_derivatives(self._state(soil, latents.entry_angle, 1.0 - speed_ratio), self.model)
         forces, d = forces.reshape(3, *shape), d.reshape(3, 7, *shape)
         slope, off = d[0, 0], latents.load - forces[0]
-        load_by = self._by_slip_and_soil(d[0], soil)
-        by = np.zeros((3, 7, *shape))
-        by[0], by[1] = self._by_slip_and_soil(d[1], soil), self._by_slip_and_soil(d[2], soil)
+        given = np.empty(d.shape)  # by slip, k_c, k_phi, n, phi, c, K; d is by `wheel.INPUTS`
+        given[:, 0], given[:, 2:] = d[:, 1], d[:, 2:]
+        np.divide(d[:, 2], self.rig.width, out=given[:, 1])
+        given[:, 4] *= 1.0 + math.tan(soil.phi) ** 2
+        load_by, by = given[0], np.zeros(d.shape)
+        by[:2] = given[1:]
         by_load = np.empty((3, *shape))
         np.divide(d[1:, 0], slope, out=by_load[:2])
         np.divide(self.rig.radius * np.sin(latents.entry_angle), slope, out=by_load[2])
@@ -289,15 +287,6 @@ class ObservationModel(Measurements):
             load_residual=off,
             by_effects=np.zeros((3, 0, *shape)),
         )
-
-    def _by_slip_and_soil(self, d: Array, soil: Soil) -> Array:
-        """Derivatives (7, N, W) of one force by slip, k_c, k_phi, n, phi, c, K from those by `wheel.INPUTS`."""
-        out = np.empty(d.shape)
-        out[0] = d[1]
-        np.divide(d[2], self.rig.width, out=out[1])
-        out[2:] = d[2:]
-        out[4] *= 1.0 + np.tan(soil.phi) ** 2
-        return out
 
     def _by_observed(self, at: Response) -> Array:
         """Derivatives A (N, m, 2 W + 1) of the residuals by the observations of the latents."""
@@ -387,10 +376,6 @@ class ObservationModel(Measurements):
         """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
         return self._corrected(gains)[5:]
 
-    def torques(self, soil: Array, gains: Array, latents: Latents) -> Array:
-        """Torques (N, W) [N m] of the model at a soil (6,) in SI."""
-        return np.asarray(self._response(Soil(*soil.tolist()), gains, latents).value[1])
-
     def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
         """Sinkage [m] (N, W) of the model, usable or not."""
         return np.asarray(sinkage(latents.entry_angle, self.rig.radius))
@@ -415,18 +400,15 @@ class ObservationModel(Measurements):
     def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
         """Derivatives (R, 4) of the residuals by `model_form.FORM` at an optimum, and these weighed by S^-1."""
         soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
-        layout, (n, m) = self.layout, at.by_latents.shape[:2]
+        n, m = at.by_latents.shape[:2]
         some = max(math.ceil(n / self.options.posterior.form_stride), 2)
         instants = np.unique(np.linspace(0, n - 1, some).round().astype(int))
         sparse = self._contact_by_form(soil, gains, latents, instants)
-        by_form = _interpolated(instants, sparse, n)  # (3, 3, N, W)
+        place, number = np.interp(np.arange(n), instants, np.arange(len(instants))), np.arange(len(instants))[:, None]
+        share = np.maximum(1.0 - np.abs(place - number), 0.0)  # linear between the instants
+        by_form = np.einsum("fpsw,sn->fpnw", sparse, share)  # (3, 3, N, W)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
-        rows = np.zeros((n, m, len(pull)))
-        rows[:, layout.torques] = self.torque_rows(-torque).transpose(1, 2, 0)
-        rows[:, layout.balance] = -pull.sum(2).T
-        if self.with_sinkage:
-            rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
+        rows = -self._rows_of(np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1))
         self._without_sides(rows, at.by_sides)
         rows[~self.known] = 0.0
         weighed = at.inverse @ rows
@@ -459,12 +441,9 @@ class ObservationModel(Measurements):
         radius, width, length = self._geometry[:, : angle.size]
         return state_on(soil, angle.ravel(), slip.ravel(), radius, width, length)
 
-    def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
-        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,).
-
-        guess: entry angles (N, W) [rad] to begin with.
-        """
-        angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
+    def start(self, soil: Soil, gains: Array | None = None) -> Latents:
+        """Latents at their measured values, or on the curves of these; entry angles solved at soil and gains (G,)."""
+        angle = np.full((self.n, self.n_wheels), np.nan)
         latents = Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
         if self._off_curve is not None:
             latents = self._latents(self.from_observed(self._measured - self._off_curve), angle)
@@ -494,7 +473,7 @@ class ObservationModel(Measurements):
         """
         shared, old, at = self._shared(previous.t), previous.latents, previous.at
         if not shared:
-            return self.start(Soil(*previous.soil.tolist()), gains=previous.gains)
+            return self.start(Soil(*previous.soil.tolist()), previous.gains)
         load, speed, ground = self.load[shared:], self.speed[shared:], self.ground_speed[shared:]
         near = np.abs(load[:, None] - old.load).argmin(axis=1), np.arange(self.n_wheels)
         slip_change = (old.ground_speed[:, None] / old.speed)[near] - ground[:, None] / speed
@@ -533,13 +512,3 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array
         diagonal += 1e-10
         inverse = np.linalg.inv(S)
     return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
-
-
-def _interpolated(instants: NDArray[np.intp], values: Array, n: int) -> Array:
-    """Linear interpolation (..., N, W) of values (..., S, W) at S of n instants, the first and the last among them."""
-    if len(instants) == n:
-        return values
-    at = np.arange(n)
-    after = np.minimum(np.searchsorted(instants, at, side="right"), len(instants) - 1)
-    share = ((at - instants[after - 1]) / (instants[after] - instants[after - 1]))[:, None]
-    return np.asarray((1.0 - share) * values[..., after - 1, :] + share * values[..., after, :])

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.linearisation import DelayTerms, Latents, Response
-from soilbus.estimation.nuisance_parameters import Free, active_at, active_with_derivatives
+from soilbus.estimation.nuisance_parameters import Free, active_at
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window
+from soilbus.estimation.window import Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
 from soilbus.terra.effects.effect import Active, Effect, Forces, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.tangent import forces_along
@@ -57,6 +57,10 @@ class ObservationModelWithEffects(ObservationModel):
         super().__init__(window, rig, model, min_speed, max_turn)
         self._set_effects(effects, free)
 
+    def with_own_stamps(self) -> Self:
+        """As `Measurements.with_own_stamps`, with the same effects."""
+        return super().with_own_stamps().with_effects(self.effects, self.free)
+
     def with_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
         """The same measurements under a model with these effects alone and their free parameters."""
         other = copy(self)
@@ -65,12 +69,10 @@ class ObservationModelWithEffects(ObservationModel):
 
     def _set_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
         self.effects, self.free = tuple(effects), tuple(free)
-        self._named = {effect.name: effect for effect in self.effects}
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self.sensor_std, std])
-        bounds = np.array([f.bounds for f in self.free]).reshape(-1, 2)
-        self.gain_bounds = np.hstack([self.gain_bounds[:, : self.n_sensors], bounds.T])
+        self.gain_bounds = np.array([(-np.inf, np.inf)] * self.n_sensors + [f.bounds for f in self.free]).T
 
     def active(self, standardised: Array) -> list[Active]:
         """The effects with their values at standardised parameters (P,)."""
@@ -80,7 +82,7 @@ class ObservationModelWithEffects(ObservationModel):
         if not self.effects:
             return super()._response(soil, gains, latents)
         standardised = gains[self.layout.effects]
-        active = active_with_derivatives(self.effects, self.free, standardised, self.n_wheels)
+        active = active_at(self.effects, self.free, standardised, self.n_wheels, derivatives=True)
         varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
         # the derivative by k_c is that by k_phi over the width
         varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
@@ -137,7 +139,7 @@ class ObservationModelWithEffects(ObservationModel):
         """As `ObservationModel.extra_pull`."""
         if not self.effects:
             return super().extra_pull(gains, latents)
-        active = active_with_derivatives(self.effects, self.free, gains[self.layout.effects], self.n_wheels)
+        active = active_at(self.effects, self.free, gains[self.layout.effects], self.n_wheels, derivatives=True)
         around, reading = self._surroundings(latents), self.draft
         if noise is not None:
             mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
@@ -176,47 +178,40 @@ class ObservationModelWithEffects(ObservationModel):
         The noise beside the smooth curve s stays with its instant, and c keeps its variance; else some delay would seem
         to fit better.  A low pass delays by its time constant.
         """
+        if not any(effect.late for effect in self.effects):
+            return None
         places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
-        standardised, P = gains[self.layout.effects], len(self.free)
-        found: dict[str, tuple[Array, Array]] = {}
+        standardised, moved = gains[self.layout.effects], False
+        columns = {"torque": self.n_wheels, "load": self.n_wheels, "ground_speed": 1, "draft": 1, "pitch": 1}
+        found = {q: (np.zeros((self.n, n)), np.zeros((len(self.free), self.n, n))) for q, n in columns.items()}
         for effect in self.effects:
             for quantity, names in effect.late.items():
                 own = [(i, self.free[i]) for name in names if (i := places.get((effect.name, name))) is not None]
                 if all(f.std == 0.0 and f.value == 0.0 for _, f in own):
                     continue
-                added, by = found.setdefault(quantity, self._no_delay(quantity, P))
+                (added, by), moved = found[quantity], True
                 d = sum(f.at(float(standardised[i])) for i, f in own)
-                for column, curve in enumerate(self._curves.of(quantity)):
+                for column, curve in enumerate(self.curves_of(quantity)):
                     added[:, column] += np.nan_to_num(self.shifted(quantity, column, curve, d))
                     slope = np.nan_to_num(curve.at(self.t + d)[1])
                     for i, f in own:
                         by[i, :, column] += f.std * slope
-        if not found:
+        if not moved:
             return None
-        torques, load, ground, draft, pitch = (
-            found.get(q) or self._no_delay(q, P) for q in ("torque", "load", "ground_speed", "draft", "pitch")
-        )
+        torques, load, ground, draft, pitch = found.values()
         loads, speed = self.layout.loads, self.layout.ground_speed
         measured = np.zeros((self.n, self.layout.n_latents))
-        by_measured = np.zeros((P, *measured.shape))
+        by_measured = np.zeros((len(self.free), *measured.shape))
         measured[:, loads], measured[:, speed] = load[0] * self.usable, ground[0][:, 0]
         by_measured[:, :, loads], by_measured[:, :, speed] = load[1] * self.usable, ground[1][:, :, 0]
-        weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)
+        weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)[:, None]
         if self._latent_matrix is not None:
             measured, by_measured = measured @ self._latent_matrix.T, by_measured @ self._latent_matrix.T
-        return DelayTerms(
-            torque=self.torque_rows(torques[0]),
-            measured=measured,
-            demand=draft[0][:, 0] + weight * pitch[0][:, 0],
-            by_torque=self.torque_rows(torques[1]),
-            by_measured=by_measured,
-            by_demand=draft[1][:, :, 0] + weight * pitch[1][:, :, 0],
+        rows, by_rows = (
+            np.concatenate([self.torque_rows(torque), of_draft + weight * of_pitch], axis=-1)
+            for torque, of_draft, of_pitch in zip(torques, draft, pitch, strict=True)
         )
-
-    def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
-        """Zero corrections (N, columns) and derivatives (P, N, columns)."""
-        columns = self.n_wheels if quantity in WHEEL_QUANTITIES else 1
-        return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
+        return DelayTerms(rows, measured, by_rows, by_measured)
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """Return the latents with the entry angles that carry their loads; gains None: effects at prior values."""
@@ -260,7 +255,8 @@ class ObservationModelWithEffects(ObservationModel):
     ) -> tuple[WheelState, WheelModel]:
         if not self.effects:
             return super()._wheels_in_contact(soil, gains, latents, instants)
-        some, active = latents.part(instants), self.active(gains[self.layout.effects])
+        active = self.active(gains[self.layout.effects])
+        some = Latents(*[own[instants] for own in latents])
         wheels = self.part(instants)._wheels(soil, active, some, some.entry_angle)
         return wheels.state, wheels.model
 

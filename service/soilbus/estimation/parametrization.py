@@ -12,14 +12,12 @@ the optimum would lie in a long curved valley; with log pressure in the place of
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.options import SearchOptions
+from soilbus.estimation.options import ESTIMATOR, SearchOptions
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 
 BOUND_TOLERANCE = 1e-4
@@ -30,26 +28,20 @@ MAX_PHI = 1.2
 _K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
 
 
-@dataclass(frozen=True)
 class Coordinates:
     """The coordinates (F,) of the free parameters, with tyres of a mean width [m].
 
     The prior decides which parameters are free, the values of the others, and the bounds.
     """
 
-    prior: SoilPrior
-    width: float
-    options: SearchOptions = field(default_factory=SearchOptions)
-
-    @cached_property
-    def log_depth(self) -> float:
-        """Logarithm of the typical depth [m]."""
-        return math.log(self.options.typical_depth)
-
-    @cached_property
-    def free(self) -> NDArray[np.intp]:
-        """Indices (F,) of the free parameters, one coordinate each."""
-        return self.prior.free
+    def __init__(self, prior: SoilPrior, width: float, options: SearchOptions = ESTIMATOR.search) -> None:
+        self.prior, self.width, self.options, self.free = prior, width, options, prior.free
+        self.log_depth = math.log(options.typical_depth)
+        self._column = {parameter: i for i, parameter in enumerate(self.free.tolist())}
+        centre, factor = prior.median[self.free], np.exp(options.bound_sd * prior.log_std[self.free])
+        self._bounds = centre / factor, np.minimum(centre * factor, np.where(self.free == _PHI, MAX_PHI, np.inf))
+        self._log_bounds = np.log(self._bounds[0]), np.log(self._bounds[1])
+        self._last = np.zeros(0), np.zeros(0)  # soil and result of the last call of `log_directions`
 
     def position(self, soil: Array) -> Array:
         """Return the coordinates (F,) of a soil (6,) in SI."""
@@ -67,14 +59,14 @@ class Coordinates:
         if _K_PHI in self._column:
             K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * self.log_depth)
             soil[_K_PHI] = K_L - soil[_K_C] / self.width
-        return self.within(soil)
+        soil[free] = np.clip(soil[free], *self._bounds)
+        return soil
 
     def log_directions(self, soil: Array) -> Array:
         """Return the derivatives (6, F) of the parameters' logarithms by the coordinates."""
-        last_soil, directions = self._last_directions
-        if last_soil is soil:
-            return directions
-        directions, column = self._own_directions.copy(), self._column
+        if self._last[0] is soil:
+            return self._last[1]
+        directions, column = np.eye(len(PARAMETERS))[:, self.free], self._column
         if _K_PHI in column:
             k_c, k_phi, n = soil[:3].tolist()
             K_L = k_phi + k_c / self.width
@@ -84,7 +76,7 @@ class Coordinates:
             if _N in column:
                 directions[_K_PHI, column[_N]] = -K_L / k_phi * n * self.log_depth
         directions.flags.writeable = False
-        self._last_directions[:] = soil, directions
+        self._last = soil, directions
         return directions
 
     def stepped(self, soil: Array, step: Array) -> Array:
@@ -100,45 +92,12 @@ class Coordinates:
         longest = self.options.max_log_step / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
 
-    def within(self, soil: Array) -> Array:
-        """Return the soil (6,) with its free parameters clipped to the bounds, in place."""
-        low, high = self._bounds
-        soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
-        return soil
-
     def active_bounds(self, soil: Array) -> Array:
         """Return the outward directions (E, F) of the bounds that a soil (6,) is at."""
         sides = at_bounds(np.log(soil[self.free]), *self._log_bounds)
         if not sides.any():
             return np.zeros((0, len(sides)))
         return np.asarray((sides[:, None] * self.log_directions(soil)[self.free])[sides != 0.0])
-
-    @cached_property
-    def _bounds(self) -> tuple[Array, Array]:
-        """Least and greatest values (F,) of the free parameters, in SI."""
-        centre, factor = self.prior.median[self.free], np.exp(self.options.bound_sd * self.prior.log_std[self.free])
-        most = np.where(self.free == _PHI, MAX_PHI, np.inf)
-        return centre / factor, np.minimum(centre * factor, most)
-
-    @cached_property
-    def _log_bounds(self) -> tuple[Array, Array]:
-        low, high = self._bounds
-        return np.log(low), np.log(high)
-
-    @cached_property
-    def _last_directions(self) -> list[Array]:
-        """The soil (6,) of the last call of `log_directions`, and its result."""
-        return [np.zeros(0), np.zeros(0)]
-
-    @cached_property
-    def _own_directions(self) -> Array:
-        """As `log_directions` (6, F), for coordinates that each are their parameter's logarithm."""
-        return np.eye(len(PARAMETERS))[:, self.free]
-
-    @cached_property
-    def _column(self) -> dict[int, int]:
-        """Index among the coordinates of each free parameter."""
-        return {parameter: i for i, parameter in enumerate(self.free.tolist())}
 
 
 @lru_cache(maxsize=16)

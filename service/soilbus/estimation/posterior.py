@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +28,8 @@ __all__ = [
     "PARAMETERS",
     "Estimate",
     "Posterior",
-    "Scalar",
     "SoilPrior",
-    "bearing_pressure",
-    "shear_strength",
-    "tan_phi",
+    "pressure_gradient",
 ]
 
 PARAMETERS = Soil._fields
@@ -81,13 +77,6 @@ class Estimate:
     std: float
 
 
-class Scalar(NamedTuple):
-    """A quantity that follows from the soil: its value and its gradient (6,) by the parameters, all in SI."""
-
-    value: float
-    gradient: Array
-
-
 @dataclass(frozen=True, slots=True)
 class Posterior:
     """Log-normal posterior of the parameters."""
@@ -125,15 +114,19 @@ class Posterior:
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> Estimate:
         """Return the pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
-        return self._estimate(bearing_pressure(self.soil, z_ref, b_ref))
+        gradient = pressure_gradient(self.soil, z_ref, b_ref)
+        return Estimate(self.soil.bearing_pressure(z_ref, b_ref), self.propagate(gradient))
 
     def tan_phi(self) -> Estimate:
         """Return the tangent of the internal friction angle."""
-        return self._estimate(tan_phi(self.soil))
+        tan = math.tan(self.soil.phi)
+        return Estimate(tan, self.propagate(np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0])))
 
     def shear_strength(self, pressure: float) -> Estimate:
         """Return the strength c + p tan phi [Pa] below a pressure p [Pa]."""
-        return self._estimate(shear_strength(self.soil, pressure))
+        tan = math.tan(self.soil.phi)
+        gradient = np.array([0.0, 0.0, 0.0, pressure * (1.0 + tan**2), 1.0, 0.0])
+        return Estimate(self.soil.c + pressure * tan, self.propagate(gradient))
 
     def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
         """Return the posterior with a covariance (6, 6) of the logarithms added, as by considered parameters.
@@ -156,26 +149,8 @@ class Posterior:
         step = np.clip(logs, -prior.log_std, prior.log_std)
         return Posterior(Soil(*(np.asarray(self.soil) * np.exp(step)).tolist()), self.log_covariance)
 
-    def _estimate(self, scalar: Scalar) -> Estimate:
-        return Estimate(scalar.value, self.propagate(scalar.gradient))
 
-
-def bearing_pressure(soil: Soil, z_ref: float, b_ref: float) -> Scalar:
-    """Return the pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (eq. 3 of Xi et al. 2024)."""
-    value = soil.bearing_pressure(z_ref, b_ref)
-    by_modulus = z_ref**soil.n
-    return Scalar(value, np.array([by_modulus / b_ref, by_modulus, value * np.log(z_ref), 0.0, 0.0, 0.0]))
-
-
-def tan_phi(soil: Soil) -> Scalar:
-    """Return the tangent of the internal friction angle."""
-    tan = float(np.tan(soil.phi))
-    return Scalar(tan, np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0]))
-
-
-def shear_strength(soil: Soil, pressure: float) -> Scalar:
-    """Return the shear strength c + p tan phi [Pa] of the soil below a pressure p [Pa] (Mohr-Coulomb)."""
-    tangent = tan_phi(soil)
-    return Scalar(
-        soil.c + pressure * tangent.value, pressure * tangent.gradient + np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-    )
+def pressure_gradient(soil: Soil, z_ref: float, b_ref: float) -> Array:
+    """Return the gradient (6,) of `Posterior.bearing_pressure` by the parameters."""
+    by_k_phi, pressure = z_ref**soil.n, soil.bearing_pressure(z_ref, b_ref)
+    return np.array([by_k_phi / b_ref, by_k_phi, pressure * math.log(z_ref), 0.0, 0.0, 0.0])

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,21 +71,16 @@ class SoilClasses:
 
         guess is the part of its prior that was only a guess (`guessed`): it is not evidence and is divided out.
         """
-        measured = _evidence(posterior, guess, self.width, self.spread[-1])
-        centre, spread = self.centre[:, measured.parameters], self.spread[:, measured.parameters]
-        off = measured.value - centre @ measured.direction.T
-        covariance = (measured.direction * spread[:, None] ** 2) @ measured.direction.T
-        covariance += np.diag(measured.variance)
+        at, direction, value, variance = _evidence(posterior, guess, self.width, self.spread[-1])
+        off = value - self.centre[:, at] @ direction.T
+        covariance = (direction * self.spread[:, None, at] ** 2) @ direction.T + np.diag(variance)
         distance = np.einsum("cm,cm->c", off, np.linalg.solve(covariance, off[:, :, None])[:, :, 0])
-        log = -0.5 * (distance + np.linalg.slogdet(covariance)[1]) + np.log(self._prior)
+        known = len(self.names) - 1
+        prior = np.append(np.full(known, (1.0 - PRIOR_UNKNOWN) / known), PRIOR_UNKNOWN)
+        log = -0.5 * (distance + np.linalg.slogdet(covariance)[1]) + np.log(prior)
         share = np.exp(log - log.max())
         share /= share.sum()
         return {self.names[i]: float(share[i]) for i in np.argsort(-share, kind="stable")}
-
-    @property
-    def _prior(self) -> Array:
-        known = len(self.names) - 1
-        return np.append(np.full(known, (1.0 - PRIOR_UNKNOWN) / known), PRIOR_UNKNOWN)
 
 
 def guessed(prior: SoilPrior, default: SoilPrior) -> SoilPrior:
@@ -95,17 +89,14 @@ def guessed(prior: SoilPrior, default: SoilPrior) -> SoilPrior:
     return SoilPrior(prior.median, np.where(is_default, prior.log_std, 1e3))
 
 
-class _Evidence(NamedTuple):
-    """M independent measurements: direction (M, P) times P coordinates is value (M,) with variance (M,)."""
+def _evidence(
+    posterior: Posterior, guess: SoilPrior, width: float, scale: Array
+) -> tuple[NDArray[np.intp], Array, Array, Array]:
+    """The posterior with the guess divided out, as M independent measurements of P coordinates.
 
-    parameters: NDArray[np.intp]
-    direction: Array
-    value: Array
-    variance: Array
-
-
-def _evidence(posterior: Posterior, guess: SoilPrior, width: float, scale: Array) -> _Evidence:
-    """The posterior with the guess divided out; information is in units of `scale` (6,)^-2."""
+    Indices (P,) of the coordinates, directions (M, P), and what direction times coordinates is: values (M,) with their
+    variances (M,).  Information is in units of `scale` (6,)^-2.
+    """
     soil = np.asarray(posterior.soil)
     is_free = np.diag(posterior.log_covariance) > 0.0
     free = np.flatnonzero(is_free)
@@ -126,7 +117,7 @@ def _evidence(posterior: Posterior, guess: SoilPrior, width: float, scale: Array
     information_mean = of_posterior @ (here[counted] / scale) - of_guess @ (centre[counted] / scale)
     is_measured = strength > 1e-3  # of the prior of `unknown`: less decides nothing
     strength, direction = strength[is_measured], direction[:, is_measured].T
-    return _Evidence(free[counted], direction / scale, direction @ information_mean / strength, 1.0 / strength)
+    return free[counted], direction / scale, direction @ information_mean / strength, 1.0 / strength
 
 
 def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> list[Soil]:

@@ -24,8 +24,8 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian, PriorQuadratic, solve_with_inverse
-from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation, Optimum
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
+from soilbus.estimation.linearisation import FIRST_GAIN, SOIL, Latents, Linearisation
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.parametrization import at_bounds, coordinates_of, step_fraction_within
@@ -42,11 +42,6 @@ class Iterate:
     soil: Array
     gains: Array
     latents: Latents
-
-    @classmethod
-    def of(cls, optimum: Optimum) -> Iterate:
-        """Return the end point of a fit."""
-        return cls(optimum.soil, optimum.gains, optimum.latents)
 
     def as_soil(self) -> Soil:
         """Return the soil by name."""
@@ -68,18 +63,16 @@ class QuadraticModel:
 
         A step that would cross an active bound goes along it, to the least value there.
         """
-        right = np.concatenate([self.gradient[None], self.active_bounds]).T
-        solution = _solution(self.information, right)
+        solution = solve_with_inverse(self.information, self.gradient)
         if solution is None:
             return None
-        step = -solution[:, 0]
-        if not len(self.active_bounds):
-            return step if np.isfinite(step).all() else None
-        held = np.zeros(len(self.active_bounds), bool)
+        (back, inverse), held = solution, np.zeros(len(self.active_bounds), bool)
+        step = -back
         while (outward := ~held & (self.active_bounds @ step > 0.0)).any():
             held |= outward
-            along, bounds = solution[:, 1:][:, held], self.active_bounds[held]
-            step = along @ np.linalg.lstsq(bounds @ along, bounds @ solution[:, 0], rcond=None)[0] - solution[:, 0]
+            bounds = self.active_bounds[held]
+            along = inverse @ bounds.T
+            step = along @ np.linalg.lstsq(bounds @ along, bounds @ back, rcond=None)[0] - back
         return step if np.isfinite(step).all() else None
 
     @property
@@ -131,22 +124,14 @@ class Objective:
             raise ValueError("the prior has no proper covariance")
         self.prior_precision = solution[1]
 
-    def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
-        """Return the same window under another joint prior."""
-        return Objective(self.problem, self.coordinates.prior, joint_prior)
+    def start(self, soil: Array, gains: Array | None = None, latents: Latents | None = None) -> Iterate:
+        """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's.
 
-    def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
-        """Return an iterate of a soil (6,) in SI and gains (G,), by default the prior's, with the latents as measured.
-
-        guess (N, W): entry angles [rad] to solve them from.
+        latents: taken where they are of this window's instants; else they are as measured.
         """
         gains = self.joint_prior.gains if gains is None else gains
-        return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains))
-
-    def start_near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
-        """Return an iterate with these latents where they are of this window's instants, else as measured."""
         if latents is None or latents.load.shape != (self.problem.n, self.problem.n_wheels):
-            return self.start(soil, gains=gains)
+            latents = self.problem.start(Soil(*soil.tolist()), gains)
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
@@ -209,41 +194,35 @@ class Objective:
 
     def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> WindowModel | None:
         """Return the quadratic model from the data's linearisation at an iterate; None where it is not finite."""
-        directions = self.directions(iterate)
+        directions, jacobian = self.directions(iterate.soil), self.prior_jacobian(iterate.soil)
         if self.as_measured:
             directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
-        gradient = directions.T @ linearisation.normal[:, 0]
-        prior = self.prior_at(iterate)
-        neg2_log_posterior = linearisation.chi2 + prior.neg2_log_prior
+        weighed, off = self.prior_precision @ jacobian, self.prior_residuals(iterate.soil, iterate.gains)
+        neg2_log_posterior = linearisation.chi2 + float(off @ self.prior_precision @ off)
         if not math.isfinite(neg2_log_posterior):
             return None
+        prior_information = jacobian.T @ weighed
         return WindowModel(
-            information=directions.T @ linearisation.normal @ directions + prior.information,
-            prior_information=prior.information,
-            gradient=gradient + prior.gradient,
+            information=directions.T @ linearisation.normal @ directions + prior_information,
+            prior_information=prior_information,
+            gradient=directions.T @ linearisation.normal[:, 0] + off @ weighed,
             neg2_log_posterior=neg2_log_posterior,
             active_bounds=self._active_bounds(iterate),
             linearisation=linearisation,
         )
-
-    def prior_at(self, iterate: Iterate) -> PriorQuadratic:
-        """Return the prior's quadratic at an iterate."""
-        by_unknowns, off = self.prior_jacobian(iterate.soil), self.prior_residuals(iterate.soil, iterate.gains)
-        weighted = by_unknowns.T @ self.prior_precision
-        return PriorQuadratic(weighted @ by_unknowns, weighted @ off, float(off @ self.prior_precision @ off))
 
     def prior_residuals(self, soil: Array, gains: Array) -> Array:
         """Return log soil and gains less the prior's mean (F + A,), of what is free and active."""
         logs = np.log(soil[self.free] / self.joint_prior.soil[self.free])
         return np.concatenate([logs, (gains - self.joint_prior.gains)[self.active]])
 
-    def directions(self, iterate: Iterate) -> Array:
+    def directions(self, soil: Array) -> Array:
         """Return the derivatives (1 + 6 + G, F + A) of (1, soil, gains) by free coordinates and active gains.
 
         So Linearisation.rows times `directions` is the residuals' Jacobian.
         """
         directions = self._gain_directions.copy()
-        directions[SOIL, : len(self.free)] = iterate.soil[:, None] * self.coordinates.log_directions(iterate.soil)
+        directions[SOIL, : len(self.free)] = soil[:, None] * self.coordinates.log_directions(soil)
         return directions
 
     def parameter_jacobian(self, soil: Array) -> Array:
@@ -387,13 +366,3 @@ def _termination(
     if n_rejected > options.max_rejected:
         return Termination.REJECTED
     return Termination.LIMIT if evaluations >= options.max_evaluations else None
-
-
-def _solution(information: Array, right: Array) -> Array | None:
-    """information^-1 right (F, M); None where the information is singular."""
-    scale = 1.0 / np.sqrt(information.diagonal())
-    try:
-        solved = np.linalg.solve(information * scale[:, None] * scale, right * scale[:, None])
-    except np.linalg.LinAlgError:
-        return None
-    return np.asarray(solved * scale[:, None])

@@ -11,17 +11,13 @@ Relaxation: Pacejka, Tire and Vehicle Dynamics (3rd ed. 2012), ch. 7.  Lateness:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
-
 import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.instrumentation import rows_in
-from soilbus.estimation.options import StandingOptions
 from soilbus.estimation.window import Rig, Window
 
-__all__ = ["SLOPES", "STANDING", "StandingColumns", "standing_columns", "standing_std", "wheel_inertia"]
+__all__ = ["SLOPES", "STANDING", "standing_columns", "standing_std", "wheel_inertia"]
 
 STANDING = (
     "relaxation_length", "wheel_inertia", "lateness.load", "lateness.ground_speed", "lateness.draft",
@@ -32,21 +28,12 @@ SLOPES = ("speed", "load", "ground_speed", "draft", "acceleration")
 """Quantities whose slopes by time these parts need."""
 
 
-class StandingColumns(NamedTuple):
-    """Derivatives by the parameters of STANDING (S): torques (N, W, S), demand (N, S), latents (N, 2 W + 1, S)."""
-
-    torque: Array
-    demand: Array
-    latents: Array
-
-
 def standing_std(rig: Rig) -> list[float]:
     """Return the prior sd of each of STANDING; 0, held, for a test rig, whose rows are no motion."""
-    options: StandingOptions = rig.options.standing
+    given = rig.options.standing
     if rig.chassis is None:
         return [0.0] * len(STANDING)
-    late = [options.load, options.ground_speed, options.draft, options.load]
-    return [options.relaxation_length, options.wheel_inertia, *late]
+    return [given.relaxation_length, given.wheel_inertia, given.load, given.ground_speed, given.draft, given.load]
 
 
 def wheel_inertia(rig: Rig) -> Array:
@@ -55,26 +42,26 @@ def wheel_inertia(rig: Rig) -> Array:
     return np.asarray(rig.options.standing.wheel_mass_share * mass * rig.radius**2 / 2.0)
 
 
-def standing_columns(window: Window, rig: Rig, slopes: Mapping[str, Array] | None = None) -> StandingColumns:
-    """Return the derivatives by STANDING at every bin of a completed window; 0 where a slope is not known.
+def standing_columns(window: Window, rig: Rig, slopes: Array | None = None) -> tuple[Array, Array]:
+    """Return the derivatives by STANDING (S) at every bin of a completed window; 0 where a slope is not known.
 
-    slopes: by time, of each of SLOPES, in its shape; by default the differences of neighbouring bins.
+    They are of the wheels' torques and the demand (N, W + 1, S), and of loads, speeds and ground speed (N, 2 W + 1, S).
+    slopes (N, 2 W + 3): by time, of the columns of SLOPES; by default the differences of neighbouring bins.
     """
     N, W, S = len(window.t), len(rig.wheels), len(STANDING)
-    columns = StandingColumns(np.zeros((N, W, S)), np.zeros((N, S)), np.zeros((N, 2 * W + 1, S)))
+    rows, latents = np.zeros((N, W + 1, S)), np.zeros((N, 2 * W + 1, S))
     if N < 3 or rig.chassis is None:
-        return columns
+        return rows, latents
     with np.errstate(invalid="ignore", divide="ignore"):
         if slopes is None:
-            slopes = {quantity: np.gradient(getattr(window, quantity), window.t, axis=0) for quantity in SLOPES}
-        speed, load, ground, draft, acceleration = (
-            np.where(np.isfinite(slopes[quantity]), slopes[quantity], 0.0) for quantity in SLOPES
-        )
-        forward = window.ground_speed[:, None]
+            slopes = np.gradient(np.column_stack([getattr(window, q) for q in SLOPES]), window.t, axis=0)
+        slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        speed, forward = slopes[:, :W], window.ground_speed[:, None]
+        ground, draft, acceleration = slopes[:, 2 * W :].T
         relaxed = (window.speed / forward * ground[:, None] - speed) / forward
-    columns.latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
-    columns.torque[:, :, 1] = -wheel_inertia(rig) * speed
-    columns.latents[:, :W, 2] = load if all(row.kind == "channel" for row in rows_in(rig, "load")) else 0.0
-    columns.latents[:, 2 * W, 3], columns.demand[:, 4] = ground, draft
-    columns.demand[:, 5] = rig.chassis.mass * acceleration
-    return columns
+    latents[:, W : 2 * W, 0] = np.where(np.isfinite(relaxed) & rig.drives, relaxed, 0.0)
+    rows[:, :W, 1] = -wheel_inertia(rig) * speed
+    if all(row.kind == "channel" for row in rows_in(rig, "load")):
+        latents[:, :W, 2] = slopes[:, W : 2 * W]
+    latents[:, 2 * W, 3], rows[:, W, 4], rows[:, W, 5] = ground, draft, rig.chassis.mass * acceleration
+    return rows, latents

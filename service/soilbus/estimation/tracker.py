@@ -18,8 +18,10 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +30,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.instants import averaged, instant_of
-from soilbus.estimation.last_run import passes_prior_conflict_test, prior_from_last_run
-from soilbus.estimation.model_form import FormPosterior, form_posterior
+from soilbus.estimation.model_form import form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, warm_start
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import ObservationModel
@@ -118,6 +119,8 @@ class Tracker:
     """Recursive estimator over windows; it holds all state from window to window.
 
     prior: the configured one of the soil; model: without effects; effects, free: of the model, and their parameters.
+    state: which soil the last window was of; newest_posterior: of the newest window that serves as a prior, None before
+    the first; components: of the sensors' variance, learned so far; instant: its length [s].
     """
 
     def __init__(
@@ -131,31 +134,15 @@ class Tracker:
     ) -> None:
         self.rig, self.prior, self.model, self.settings, self.options = rig, prior, model, settings, rig.options.tracker
         self.effects, self.free = tuple(effects), tuple(free)
+        self.instant = instant_of(rig, settings.instant)
         self._new_soil_prior = new_soil_prior(prior)
         self._last_run: tuple[Gaussian, float] | None = None
-        self._components = VarianceComponents(rig.options.variance)
-        self._posteriors: list[tuple[float, Gaussian]] = []
         self.reset()
 
     @property
     def soil_prior(self) -> SoilPrior:
         """Prior of the present soil: the configured one, or the wider one of a new soil."""
-        return self.prior if self._state.transition is None else self._new_soil_prior
-
-    @property
-    def instant(self) -> float:
-        """Length [s] of an instant."""
-        return instant_of(self.rig, self.settings.instant)
-
-    @property
-    def state(self) -> SoilState:
-        """Which soil the last window was of."""
-        return self._state
-
-    @property
-    def newest_posterior(self) -> Gaussian | None:
-        """Posterior of the newest window that serves as a prior; None before the first."""
-        return self._newest_posterior
+        return self.prior if self.state.transition is None else self._new_soil_prior
 
     def start_from_last_run(self, gaussian: Gaussian, elapsed: float) -> None:
         """Take the gains of the last run, `elapsed` seconds ago, as prior now and after each reset."""
@@ -166,33 +153,26 @@ class Tracker:
         known = other.newest_posterior
         if known is None:
             return
-        gains = gain_errors(self.rig, self.model, self.free)[1]
-        covariance = np.zeros((_SOIL + len(gains),) * 2)
-        covariance[:_SOIL, :_SOIL] = known.covariance[:_SOIL, :_SOIL]
-        covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] = gains**2
-        self._posteriors.append((t, Gaussian(known.soil, np.zeros(len(gains)), covariance)))
+        gaussian = replace(Gaussian.of(self.prior, gain_errors(self.rig, self.model, self.free)[1]), soil=known.soil)
+        gaussian.covariance[:_SOIL, :_SOIL] = known.covariance[:_SOIL, :_SOIL]
+        self._posteriors.append((t, gaussian))
 
     def reset(self) -> None:
         """Forget all windows."""
-        self._state = SoilState()
+        self.state = SoilState()
+        self.newest_posterior: Gaussian | None = None
+        self.components = VarianceComponents(self.rig.options.variance)
         self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
-        self._posteriors = []
-        self._newest_posterior: Gaussian | None = None
-        self._components = VarianceComponents(self.rig.options.variance)
-
-    @property
-    def components(self) -> VarianceComponents:
-        """Variance components of the sensors, learned from the windows so far."""
-        return self._components
+        self._posteriors: list[tuple[float, Gaussian]] = []
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         """Estimate one window of bin means that ends at `end` [s]; windows come in their order."""
         recent = end - self._good_until <= self.options.max_unexplained * self.settings.window
         self._budget.next_window(len(window.t), refill=recent)
         if not recent:  # what windows before left is no measure of ground that none of them was on
-            self._components = VarianceComponents(self.rig.options.variance)
+            self.components = VarianceComponents(self.rig.options.variance)
         return replace(self._estimate(averaged(window, end, self.instant), end), search_ended=self._budget.ended)
 
     def _estimate(self, window: Window, end: float) -> TrackerOutput:
@@ -202,15 +182,15 @@ class Tracker:
         if present.problem.n_rows < self.settings.min_rows:
             self._fit = None
             return TrackerOutput(None, False, TrackerState.STEADY, present.since, *left_out, reason=Reason.TOO_FEW_DATA)
-        self._discard_before(end - self.settings.window)
+        self._posteriors = self._posteriors[max(self._newest_ended(end - self.settings.window), 0) :]
         one = self._one_soil(present)
-        if not self._components.weight and not (self.settings.stated_noise and self.mismatch(one.fit)):
+        if not self.components.weight and not (self.settings.stated_noise and self.mismatch(one.fit)):
             present, one = self._with_components(present, window, end, one)
         change = self._change_point(present, one)
         explanation = self._explained(present, one, change)
         fit = explanation.fit
         shown = Shown(explanation.found, explanation.transition, change, self.mismatch(fit))
-        state = next_state(self._state, shown, end, self.settings.window)
+        state = next_state(self.state, shown, end, self.settings.window)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
             reason=state.reason, change=state.change, prediction=self._prediction(one),
@@ -220,7 +200,7 @@ class Tracker:
 
     def _present(self, window: Window, end: float) -> _Present:
         """The window's data of the present soil."""
-        start, transition = end - self.settings.window, self._state.transition
+        start, transition = end - self.settings.window, self.state.transition
         since = start if transition is None else max(transition.end, start)
         if transition is not None:
             window = without_transition(window, transition, self.rig.ahead)
@@ -230,27 +210,26 @@ class Tracker:
 
     def _problem(self, window: Window) -> ObservationModel:
         speed, turn = self.settings.min_speed, self.settings.max_turn
-        window = self._components.scaled(window, self.rig)
+        window = self.components.scaled(window, self.rig)
         problem = ObservationModelWithEffects(window, self.rig, self.model, speed, turn, self.effects, self.free)
         problem.work = self._budget.work
         return problem
 
     def _one_soil(self, present: _Present) -> _Explanation:
         """The window as one soil, the present one: from the optimum of the last window, else from many starts."""
-        last = self._fit
-        if last is None:
+        if self._fit is None:
             return self._searched(present)
-        warm = warm_start(present.problem, self.soil_prior, last, present.joint_prior)
+        warm = warm_start(present.problem, self.soil_prior, self._fit, present.joint_prior)
         fit = fit_warm(warm)
         if fit is None or not fit.converged:
             fit = self._search(present.problem, self.soil_prior, present.joint_prior) or fit
-        return _Explanation(warm.objective, fit, present.since, warm, transition=self._state.transition)
+        return _Explanation(warm.objective, fit, present.since, warm, transition=self.state.transition)
 
     def _searched(self, present: _Present) -> _Explanation:
         """The window as one soil, the present one, from many starts."""
         fit = self._search(present.problem, self.soil_prior, present.joint_prior)
         objective = Objective(present.problem, self.soil_prior, present.joint_prior)
-        return _Explanation(objective, fit, present.since, transition=self._state.transition)
+        return _Explanation(objective, fit, present.since, transition=self.state.transition)
 
     def _with_components(
         self, present: _Present, window: Window, end: float, one: _Explanation
@@ -260,14 +239,14 @@ class Tracker:
             fit, work_before = one.fit, self._budget.work.instants
             if fit is None or not self._budget.allows():
                 break
-            ratios = correction_ratios(one.objective.problem, fit.optimum, self._components.options)
-            self._components = self._components.after(ratios, whole=True)
+            ratios = correction_ratios(one.objective.problem, fit.optimum, self.components.options)
+            self.components = self.components.after(ratios, whole=True)
             present = self._present(window, end)
             warm = warm_start(present.problem, self.soil_prior, fit, present.joint_prior)
             one = _Explanation(warm.objective, fit_warm(warm) or fit, present.since, None, transition=one.transition)
             self._budget.spend(work_before)
         if self.mismatch(one.fit):  # what no soil explains says nothing of the sensors
-            self._components = VarianceComponents(self.rig.options.variance)
+            self.components = VarianceComponents(self.rig.options.variance)
         return present, one
 
     def _prediction(self, one: _Explanation) -> Mapping[str, Share]:
@@ -279,7 +258,7 @@ class Tracker:
 
     def _change_point(self, present: _Present, one: _Explanation) -> ChangePoint | None:
         """Where the newest data disagree with the present soil; what it was while nothing explains the data since."""
-        options, length, change, last = self.options, self.settings.window, self._state.change, self._fit
+        options, length, change, last = self.options, self.settings.window, self.state.change, self._fit
         if change is not None and change.t <= present.end - options.max_unexplained * length:
             change = None  # a new soil would have been found by now
         fit, warm = one.fit, one.warm
@@ -324,28 +303,28 @@ class Tracker:
         if old is None and not self.mismatch(one.fit):
             return None
         joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
-        candidates = self._candidate_transitions(change, float(window.t[0]))
-        new = self._after_transition(window, candidates, joint_prior)
+        new = self._after_transition(window, change, joint_prior)
         if new is not None and new.transition is not None:
             separated = without_transition(window, new.transition, self.rig.ahead)
             whole = present._replace(window=separated, problem=self._problem(separated))
-            if old is not None and not self._are_likelier(old, new.fit, self._searched(whole).fit):
-                return None
+            together = None if old is None else self._searched(whole).fit
+            if old is not None and new.fit is not None and together is not None and together.converged:
+                gain = together.neg2_log_evidence - old.neg2_log_evidence - new.fit.neg2_log_evidence
+                if gain < self.options.significance:
+                    return None
             return new._replace(found=Reason.TWO_SOILS)
         if warm is None or old is None or end >= change.t + self.options.min_to_detect * self.settings.window:
             return None
         reason = Reason.CHANGE_STATISTIC if change.statistic.is_alarm else Reason.MISMATCH
-        return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
+        return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self.state.transition)
 
-    def _after_transition(
-        self, window: Window, transitions: Iterable[Transition], joint_prior: Gaussian
-    ) -> _Explanation | None:
-        """The data after the first of some transitions that leaves one new soil; None where none does."""
+    def _after_transition(self, window: Window, change: ChangePoint, joint_prior: Gaussian) -> _Explanation | None:
+        """The data after the first candidate transition that leaves one new soil; None where none does."""
         prior = self._new_soil_prior
-        for transition in transitions:
+        for transition in self._candidate_transitions(change, float(window.t[0])):
             separated = without_transition(window, transition, self.rig.ahead)
             problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
-            arrived = transition.end + transition.lag if self._state.mismatch else transition.end
+            arrived = transition.end + transition.lag if self.state.mismatch else transition.end
             if problem.n_rows < self.settings.min_rows or window.t[-1] < arrived:
                 return None  # after a mismatch both axles and the draft must agree on the new soil
             fit = self._search(problem, prior, joint_prior)
@@ -360,13 +339,6 @@ class Tracker:
         ends = [change.t + length * lag for length in self.options.transition_lengths]
         n_over = sum(end <= start for end in ends)
         return [Transition(change.t - TIME_TOLERANCE, end, lag) for end in ends[max(n_over - 1, 0) :]]
-
-    def _are_likelier(self, old: Fit, new: Fit | None, one: Fit | None) -> bool:
-        """Whether two soils have much more evidence than one, of the same data."""
-        if one is None or new is None or not one.converged:
-            return new is not None
-        gain = one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence
-        return gain >= self.options.significance
 
     def _another_soil(self, present: _Present, one: _Explanation) -> _Explanation:
         """The window as one soil, a new one where the prior of the present one conflicts with the data."""
@@ -402,27 +374,34 @@ class Tracker:
 
     def _prior_at(self, t: float, problem: ObservationModel) -> Gaussian:
         """Posterior of the newest window that ended by t [s], plus drift since."""
-        ended = self._ended(t)
-        if not ended:
+        newest = self._newest_ended(t)
+        if newest < 0:
             return self._initial_prior(problem)
-        end, gaussian = self._posteriors[ended[-1]]
+        end, gaussian = self._posteriors[newest]
         elapsed = (t - end) / self.settings.window + 1.0  # from the middle of that window to the middle of this one
         forgotten = 1.0 / self.options.gain_memory + (t - end) / self.options.gain_correlation_time
         gaussian = gaussian.forgotten(math.exp(-forgotten), problem.gain_std)
-        if self._state.transition is not None and end <= self._state.transition.end:
+        if self.state.transition is not None and end <= self.state.transition.end:
             return gaussian.with_prior_soil(self.soil_prior)
         return gaussian.drifted(self._drift(gaussian, elapsed))
 
     def _initial_prior(self, problem: ObservationModel) -> Gaussian:
-        """Prior of the first window: with the gains of the last run if they pass the prior-conflict test."""
-        if self._last_run is not None:
-            last, elapsed = self._last_run
-            correlation_time = self.options.gain_correlation_time
-            joint_prior = prior_from_last_run(last, self.soil_prior, problem.gain_std, elapsed, correlation_time)
-            if passes_prior_conflict_test(problem, self.soil_prior, joint_prior):
-                return joint_prior
-            self._last_run = None
-        return Gaussian.of(self.soil_prior, problem.gain_std)
+        """Prior of the first window: with the gains of the last run where it is at least as likely as without.
+
+        A sensor exchanged or calibrated since then has another gain error.
+        """
+        without = Gaussian.of(self.soil_prior, problem.gain_std)
+        if self._last_run is None:
+            return without
+        last, elapsed = self._last_run
+        kept = math.exp(-elapsed / self.options.gain_correlation_time)
+        with_gains = last.with_prior_soil(self.soil_prior).wandered(kept, problem.gain_std)
+        fits = (fit_window(problem, self.soil_prior, prior) for prior in (without, with_gains))
+        other, fit = (fit if fit is not None and fit.converged else None for fit in fits)
+        if fit is not None and (other is None or fit.neg2_log_evidence <= other.neg2_log_evidence):
+            return with_gains
+        self._last_run = None
+        return without
 
     def _drift(self, gaussian: Gaussian, elapsed: float) -> Array:
         """Covariance (6, 6) of the drift of the soil's logarithms in `elapsed` windows."""
@@ -430,46 +409,32 @@ class Tracker:
         directions = coordinates.log_directions(gaussian.soil)
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
-    def _ended(self, t: float) -> list[int]:
-        """Indices of the posteriors of windows that ended by t [s]."""
-        return [i for i, (end, _) in enumerate(self._posteriors) if end <= t + TIME_TOLERANCE]
-
-    def _discard_before(self, start: float) -> None:
-        """Discard posteriors that no window from `start` [s] on can use as prior."""
-        self._posteriors = self._posteriors[max([0, *self._ended(start)]) :]
+    def _newest_ended(self, t: float) -> int:
+        """Index of the newest posterior of a window that ended by t [s]; -1 without one."""
+        return bisect_right(self._posteriors, t + TIME_TOLERANCE, key=itemgetter(0)) - 1
 
     def _reported(self, objective: Objective, fit: Fit | None) -> Fit | None:
         """The fit as it is reported: with what the form of the contact leaves open."""
         if fit is None or not fit.converged:
             return fit
-        form = self._form_posterior(objective, fit)
         half = (self.options.steady_drift / 2.0) ** 2  # from a window's middle to its end
         mode = fit.mode.drifted(self._drift(fit.mode, half))
+        form = form_posterior(objective, fit, self.settings.form) if any(self.settings.form) else None
         return replace(fit, mode=mode, form=form)
-
-    def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:
-        """What the form of the model leaves open of a fit; None where the form is held."""
-        if not any(self.settings.form):
-            return None
-        prior, carried = FormPosterior.of(self.settings.form, len(fit.gains)), objective.joint_prior.form
-        if carried is not None:
-            prior = replace(prior, by_form=carried.by_form)
-        with np.errstate(all="ignore"):
-            return form_posterior(objective, fit, prior)
 
     def _store(self, tracked: TrackerOutput, state: SoilState, end: float, problem: ObservationModel) -> None:
         """Store the result for later windows; a mismatch does not become a prior."""
-        fit, self._state = tracked.fit, state
+        fit, self.state = tracked.fit, state
         self._fit = fit if fit is not None and fit.converged else None
         if fit is None or tracked.mismatch:
             return
         self._good_until = end
-        ratios = correction_ratios(problem, fit.optimum, self._components.options)
-        self._components = self._components.after(ratios)
+        ratios = correction_ratios(problem, fit.optimum, self.components.options)
+        self.components = self.components.after(ratios)
         learned = end - tracked.since >= self.options.min_to_learn * self.settings.window
         if learned and state.name in (TrackerState.STEADY, TrackerState.NEW_SOIL):
             self._posteriors.append((end, replace(fit.mode, form=fit.form)))
-            self._newest_posterior = fit.mode
+            self.newest_posterior = fit.mode
 
 
 def new_soil_prior(prior: SoilPrior) -> SoilPrior:

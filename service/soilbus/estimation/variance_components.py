@@ -91,9 +91,8 @@ def corrections(problem: ObservationModel, at: Linearisation, gains: Array) -> t
     by_latents = (e[:, None] @ A)[:, 0]
     shares = variance * (A * (at.inverse @ A)).sum(axis=1)
     of_rows = row_var * np.einsum("nmm->nm", at.inverse)
-    layout, known = problem.layout, problem.known
-    known = known & problem.measured_rows
-    measured, loads = problem.measured_latents, layout.loads
+    layout, (of_sensor, measured) = problem.layout, problem.is_measured
+    known, loads = problem.known & of_sensor, layout.loads
     if problem.rig.lengths is not None:  # a track's load is the mean of a window, and single instants do not show it
         shares[:, loads] = np.where(problem.rig.lengths > 0.0, 0.0, shares[:, loads])
     expected = np.hstack([np.where(known, of_rows, 0.0), np.where(measured, shares, 0.0)])
@@ -111,5 +110,6 @@ def corrections(problem: ObservationModel, at: Linearisation, gains: Array) -> t
 
 def block_sums(values: Array, t: Array, block: float) -> Array:
     """Return sums (B, C) of values (N, C) at times t (N,) [s] over blocks of this length [s]."""
-    number = np.floor(t / block).astype(np.intp)
-    return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(number, prepend=number[0] - 1)), axis=0))
+    number = np.floor(t / block)
+    starts = np.flatnonzero(number[1:] != number[:-1]) + 1
+    return np.asarray(np.add.reduceat(values, np.concatenate([[0], starts]), axis=0))

@@ -150,30 +150,26 @@ class Window:
     roll: Array = field(default_factory=lambda: np.empty(0))
     steering_angle: Array = field(default_factory=lambda: np.empty(0))
     differential_lock: Array = field(default_factory=lambda: np.empty(0))
-    # (N,), -1 where the vehicle reversed before `forward`; empty where it never did
+    # (N,), -1 where the vehicle reversed before `forward`, else 1
     direction: Array = field(default_factory=lambda: np.empty(0))
     observations: Observations | None = None  # of `instrumentation.completed`
     kinematic: bool = False  # whether an acceleration that was a specific force has become dv/dt
 
     def __post_init__(self) -> None:
-        for quantity in ("yaw_rate", "roll", "steering_angle", "differential_lock"):
+        for quantity in ("yaw_rate", "roll", "steering_angle", "differential_lock", "direction"):
             if len(getattr(self, quantity)) != len(self.t):
-                object.__setattr__(self, quantity, np.full(len(self.t), np.nan))
-
-    @property
-    def directions(self) -> Array:
-        """(N,), -1 where the vehicle reversed, else 1."""
-        return self.direction if len(self.direction) else np.ones(len(self.t))
+                object.__setattr__(self, quantity, np.full(len(self.t), 1.0 if quantity == "direction" else np.nan))
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Window:
         """Return the window with the given bins only; a slice copies nothing."""
         values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
+        given = self.observations
         return replace(
             self,
             t=self.t[keep],
             variance={q: v[keep] for q, v in self.variance.items()},
-            direction=self.direction[keep] if len(self.direction) else self.direction,
-            observations=None if self.observations is None else self.observations.rows(keep),
+            direction=self.direction[keep],
+            observations=given and type(given)(*[column[keep] for column in given]),
             **values,
         )
 
@@ -375,7 +371,7 @@ def zero_if_unknown(values: Array) -> Array:
 def steady(window: Window) -> Window:
     """Return the window with gaps of pitch, roll and acceleration filled by straight lines, as loads need them."""
     changed: dict[str, Any] = {}
-    variance, direction = dict(window.variance), window.directions
+    variance, direction = dict(window.variance), window.direction
     for name, sign in (("pitch", direction), ("acceleration", direction), ("roll", np.ones(len(window.t)))):
         known = np.isfinite(values := getattr(window, name))
         if known.any() and not known.all():

@@ -19,7 +19,7 @@ from soilbus.decision.capability import assess
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.diagnosis.diagnose import Diagnosis, NotFitted, diagnose
 from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.estimation.assembly import motors_of, possible_effects, prior_of
+from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.manoeuvre import Plan, what_to_drive
 from soilbus.offline.recordings import Recordings, recordings_of
@@ -71,7 +71,7 @@ def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Con
         problem.model, fitted.effects, fitted.free, fitted.fits[record].mode, len(problem.rig.wheels),
         float(latents.ground_speed.mean()),
     )  # fmt: skip
-    limit = ReportedLimits(motors_of(config, problem.rig)).at(0.0)
+    limit = ReportedLimits(config, problem.rig).at(0.0)
     settings = config.traversability
     capability, _ = assess(soil, problem.rig, model, None, limit, settings.max_slip, settings.max_sinkage)
     return None if capability is None else capability.max_draft

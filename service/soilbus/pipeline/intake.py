@@ -28,11 +28,12 @@ from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
 from soilbus.decision.moments import Moment, moment_of
 from soilbus.decision.options import WATCH
-from soilbus.estimation.assembly import Motor, Motors, delays_of, motors_of, rig_of
+from soilbus.estimation.assembly import Motor, delays_of, motors_of, rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import (
     VEHICLE_QUANTITIES,
     WHEEL_QUANTITIES,
+    Rig,
     Window,
     forward,
     steady,
@@ -150,9 +151,9 @@ class ReportedLimits:
     several motors that of the last with a limit.
     """
 
-    def __init__(self, motors: Motors, samples: int = RECEPTION.limit_samples) -> None:
-        self._motors, self._samples = motors, samples
-        self._names = {motor.name for motor in motors.motors}
+    def __init__(self, config: Config, rig: Rig, samples: int = RECEPTION.limit_samples) -> None:
+        self._motors, self._driven, self._samples = motors_of(config, rig), rig.drives, samples
+        self._names = {motor.name for motor in self._motors}
         self._reported: dict[str, tuple[Array, Array]] = {}
 
     def add(self, name: str, t: Array, value: Array) -> None:
@@ -163,8 +164,8 @@ class ReportedLimits:
 
     def at(self, t: float) -> Array:
         """Return the limits (W,) in force at the time t [s]."""
-        out = np.where(self._motors.driven, np.nan, 0.0)
-        for motor in self._motors.motors:
+        out = np.where(self._driven, np.nan, 0.0)
+        for motor in self._motors:
             limit = self._of(motor, t)
             if math.isfinite(limit):
                 out[list(motor.wheels)] = limit * np.array(motor.share)
@@ -215,7 +216,7 @@ class Intake:
         self._latest = max([0.0, *late.values()])
         self._waits = {name: self._latest - delay for name, delay in late.items() if self._latest != delay}
         self._settings = config.estimator
-        self._limits = ReportedLimits(motors_of(config, self.rig), options.limit_samples)
+        self._limits = ReportedLimits(config, self.rig, options.limit_samples)
         self.ended = 0
         """Windows that have ended since the start, and restarts of the clock."""
         self.epoch = 0

@@ -17,7 +17,7 @@ from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.options import DEFAULT
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict
-from soilbus.estimation.posterior import Posterior, bearing_pressure
+from soilbus.estimation.posterior import Posterior, pressure_gradient
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
 from soilbus.terra.vehicle import GRAVITY
@@ -191,9 +191,10 @@ def pressure_error(found: Detectable, before: Sequence[Posterior], config: Confi
     """
     errors = []
     for posterior, soil_error in zip(before, found.soil_error, strict=True):
-        pressure = bearing_pressure(posterior.soil, config.estimator.z_ref, config.estimator.b_ref)
-        by_logs = pressure.gradient * np.array(posterior.soil) / pressure.value
-        errors.append((float(np.expm1(by_logs @ soil_error)), posterior.propagate(pressure.gradient) / pressure.value))
+        at = config.estimator.z_ref, config.estimator.b_ref
+        pressure = posterior.bearing_pressure(*at)
+        by_logs = pressure_gradient(posterior.soil, *at) * np.array(posterior.soil) / pressure.value
+        errors.append((float(np.expm1(by_logs @ soil_error)), pressure.std / pressure.value))
     return max(errors, key=lambda error: abs(error[0]) / max(error[1], 1e-12))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from soilbus.can.channels import Column
 from soilbus.config.model import Config
 from soilbus.diagnosis.joint_fit import Start, fit_jointly
-from soilbus.estimation.assembly import model_of, motors_of, rig_of
+from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.multistart import Fit
@@ -42,7 +42,7 @@ def observed(
 
 def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:
     """Return the limits (W,) [N m] that the service takes where none is reported."""
-    return ReportedLimits(motors_of(config, rig)).at(0.0)
+    return ReportedLimits(config, rig).at(0.0)
 
 
 def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np.float64], fresh: bool) -> WindowTask:

@@ -50,7 +50,7 @@ def estimate(case: Case) -> Answer | None:
 
 def _reading(problem: ObservationModel, i: int, known: Soil, x: Array) -> tuple[Array, Array, Array]:
     """Innovation (2 W + 1,) of loads, torques and pull, its slopes by phi and n, and the noise's covariance."""
-    rig, angle = problem.rig, entry_angles(problem)[i]
+    rig, angle, W = problem.rig, entry_angles(problem)[i], problem.n_wheels
     K_L = lumped_modulus(known.k_c, known.k_phi, rig.width)
     tan_phi = np.tan(x[0])
     state = WheelState(angle, problem.slip[i], rig.radius, rig.width, K_L, x[1], tan_phi, known.c, known.K)
@@ -65,8 +65,9 @@ def _reading(problem: ObservationModel, i: int, known: Soil, x: Array) -> tuple[
     H = np.stack([rows(4).sum(1) * (1.0 + tan_phi**2), rows(3).sum(1)], axis=1)
     angle_var = problem.sinkage_var[i] / (rig.radius * np.sin(angle)) ** 2
     rolled = (1.0 - problem.slip[i]) ** 2
-    speeds = problem.speed_var[i] / problem.speed[i] ** 2 + problem.ground_speed_var[i] / problem.ground_speed[i] ** 2
-    own = np.concatenate([problem.load_var[i], problem.torque_var[i], [problem.demand_var[i]]])
+    load_var, speed_var, (ground_var,) = np.split(problem.variances(np.zeros(len(problem.gain_std)))[0][i], [W, 2 * W])
+    speeds = speed_var / problem.speed[i] ** 2 + ground_var / problem.ground_speed[i] ** 2
+    own = np.concatenate([load_var, problem.torque_var[i], [problem.demand_var[i]]])
     R = np.diag(own) + (rows(0) * angle_var) @ rows(0).T + (rows(1) * rolled * speeds) @ rows(1).T
     return innovation, H, R
 

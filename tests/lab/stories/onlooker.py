@@ -370,23 +370,14 @@ class TrueTracker(Tracker):
 
     def __init__(self, drive: Drive, *args: Any, **named: Any) -> None:
         self.drive = drive
-        self.said: Gaussian | None = None
         super().__init__(*args, **named)
-
-    @property
-    def newest_posterior(self) -> Gaussian | None:
-        return self.said
-
-    def reset(self) -> None:
-        super().reset()
-        self.said = None
 
     def start_from_last_run(self, gaussian: Gaussian, elapsed: float) -> None:
         self.drive.recalled = gaussian, elapsed
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         tracked = self.drive.truth(window, end)
-        self.said = fit_of(tracked).mode
+        self.newest_posterior = fit_of(tracked).mode
         return tracked
 
 
