@@ -141,7 +141,8 @@ class ObservationModel(Measurements):
         inverse = self.inverse_covariance(A, variance, row_var)
         # draft and inertia without their noise, which S^-1 r says: an error times noise would fit better when smaller
         noise = self.has_balance * (inverse[:, balance] * residual).sum(1)
-        _, quiet_by_effects = self.extra_pull(gains, latents, noise)
+        quiet, quiet_by_effects = self.extra_pull(gains, latents, noise)
+        residual[:, balance] += self.has_balance * (quiet - extra)
         by_effects[:, balance] += (self.has_balance * (quiet_by_effects - extra_by_effects)).T
         if by_sensors:
             true_draft = self.has_balance * (draft - self.draft_noise * of_draft**2 * noise)
