@@ -55,7 +55,7 @@ def at(request, problems):
 def predicted(problem, soil, gains, latents):
     """Drawbar pull, torque and sinkage (3, N, W), and the pull beyond the measured demand (N,)."""
     response = problem._response(soil, gains, latents)
-    return response.value, problem.extra_pull(gains, latents, NOISE)[0]
+    return response.value, problem.extra_pull(gains, latents, NOISE)[0].sum(0)
 
 
 def moved(problem, gains, latents):
@@ -114,7 +114,7 @@ def test_a_mass_share_leaves_the_noise_of_the_readings_in_the_balance(problems):
     free = parameters_of(effect, problems["exponential"].n_wheels)
     problem = problems["exponential"].with_effects([effect], free)
     gains = np.zeros(problem.n_sensors + len(free))
-    latents = problem.start(SOIL, None, gains)
+    latents = problem.start(SOIL, gains)
     more = gains + PULL * (np.arange(len(gains)) == problem.n_sensors)
     balance = [
         problem.linearise(SOIL, g, latents).rows[:, 0].reshape(problem.n, -1)[:, problem.layout.balance]

@@ -35,10 +35,10 @@ def of_springs(draft: float) -> np.ndarray:
 @pytest.mark.parametrize("cells", [True, False])
 def test_the_largest_draft_of_six_wheels_on_loam_is_within_its_interval(cells):
     config = six_wheels(cells)
-    found = [trial(config, "loam", seed) for seed in range(8)]
+    found = [trial(config, "loam", seed) for seed in range(16)]
     off = np.array([(each.predicted - each.true) / each.std for each in found])
     assert np.isfinite(off).all()
-    assert (np.abs(off) < 1.96).sum() >= 7  # of eight 95 % intervals: one miss or none in 94 of 100 cases
+    assert (np.abs(off) < 1.96).sum() >= 14  # of sixteen 95 % intervals: two misses at most in 96 of 100 cases
     assert np.median([abs(each.predicted / each.true - 1.0) for each in found]) < 0.1
     assert np.median([each.std / each.true for each in found]) < 0.2
 

@@ -103,7 +103,7 @@ class ObservationModel(Measurements):
         rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
         extra, extra_by_effects = self.extra_pull(gains, latents)
-        residual[:, torques], residual[:, balance] = self.torque * of_torque, inertia + draft + extra
+        residual[:, torques], residual[:, balance] = self.torque * of_torque, inertia + draft + extra.sum(0)
         if self.with_sinkage:
             residual[:, sinkages] = self.sinkage
         predicted, by_soil[:], by_effects[:] = map(self._rows_of, (at.value, -at.by_soil, -at.by_effects))
@@ -142,7 +142,7 @@ class ObservationModel(Measurements):
         # draft and inertia without their noise, which S^-1 r says: an error times noise would fit better when smaller
         noise = self.has_balance * (inverse[:, balance] * residual).sum(1)
         quiet, quiet_by_effects = self.extra_pull(gains, latents, noise)
-        residual[:, balance] += self.has_balance * (quiet - extra)
+        residual[:, balance] += self.has_balance * (quiet[1] - extra[1])
         by_effects[:, balance] += (self.has_balance * (quiet_by_effects - extra_by_effects)).T
         if by_sensors:
             true_draft = self.has_balance * (draft - self.draft_noise * of_draft**2 * noise)
@@ -211,11 +211,12 @@ class ObservationModel(Measurements):
         return held
 
     def extra_pull(self, gains: Array, latents: Latents, noise: Array | None = None) -> tuple[Array, Array]:
-        """Pull [N] (N,) that effects ask of the wheels beyond the measured demand, and its derivatives (P, N).
+        """Pull [N] (2, N) that effects ask of the wheels beyond the measured demand, and its derivatives (P, N).
 
-        noise (N,) [1/N]: S^-1 r of the balance, by which draft and acceleration lose their noise; None: as read.
+        The first is by masses and slopes, the second by errors of the draft.  noise (N,) [1/N]: S^-1 r of the balance,
+        by which draft and acceleration lose their noise; None: as read.
         """
-        return np.zeros(self.n), np.zeros((len(gains) - self.n_sensors, self.n))
+        return np.zeros((2, self.n)), np.zeros((len(gains) - self.n_sensors, self.n))
 
     def _side_load(self, A: Array, torque: Array, now: Array) -> Array:
         """Observations (N, S) of loads left less right after a Newton step from those `now` to equal torques (N, W)."""

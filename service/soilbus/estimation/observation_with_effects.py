@@ -145,16 +145,16 @@ class ObservationModelWithEffects(ObservationModel):
             mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
             quiet = around.acceleration - (mass * self.acceleration_var * noise)[:, None]
             around, reading = around._replace(acceleration=quiet), reading - self.draft_var * noise
-        draft, pull = true_draft(active, reading, around), np.zeros(self.n)
+        draft, resistance, error = true_draft(active, reading, around), np.zeros(self.n), np.zeros(self.n)
         for effect, values in active:
             if effect.resistance is not None:
-                pull = pull + effect.resistance(around, values)
+                resistance = resistance + effect.resistance(around, values)
             if effect.draft is not None:
-                pull = pull - effect.draft(draft, around, values)
+                error = error - effect.draft(draft, around, values)
         by_effects = np.zeros((len(self.free), self.n))
         for i in range(len(self.free)):
-            by_effects[i] = slope_of(pull, i)
-        return np.asarray(value_of(pull)), by_effects
+            by_effects[i] = slope_of(resistance + error, i)
+        return np.stack([np.asarray(value_of(part)) for part in (resistance, error)]), by_effects
 
     def _surroundings(self, latents: Latents) -> Surroundings:
         chassis = self.rig.chassis
