@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import subprocess
@@ -33,6 +34,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if (item.get_closest_marker("vcan") or item.get_closest_marker("systemd")) and not _in_real_time(item.nodeid):
             raise pytest.UsageError(f"{item.nodeid} needs a real bus, and only tests in {IN_REAL_TIME} take turns")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let the processes of tests in real time go before those that compute."""
+    if not _in_real_time(item.nodeid):
+        os.nice(max(10 - os.nice(0), 0))
 
 
 def _in_real_time(nodeid: str) -> bool:
