@@ -47,15 +47,13 @@ def _in_real_time(nodeid: str) -> bool:
 
 
 class _TakingTurns(LoadFileScheduling):
-    """Give the tests of a file to one worker, for they share fixtures, and those in real time to two.
+    """Give the tests of a file to one worker, for they share fixtures, and all tests in real time to one.
 
-    There is one vcan0; what systemd runs in a guest of its own judges no times that a second guest beside it spoils.
+    There is one vcan0, and two guests beside each other spoil each other's times.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        if not _in_real_time(nodeid):
-            return super()._split_scope(nodeid)
-        return "systemd" if nodeid.startswith("tests/systemd/") else "vcan0"
+        return "real time" if _in_real_time(nodeid) else super()._split_scope(nodeid)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
