@@ -31,7 +31,7 @@ SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli.main import main;
 SECONDS = 24.6  # the last window ends well before the service is stopped
 HOP = 1.0
 FIRST_WINDOW = 10.0
-TRIES = 3
+TRIES = 6
 HELD_UP = 0.3
 """Seconds by which the player may be late: that is no service's doing."""
 
