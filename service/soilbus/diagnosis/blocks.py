@@ -20,11 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.linearisation import RESIDUAL, Linearisation
-
-GAIN_LEFT_OUT = 0.99
-"""Share of a sensor gain's prior that is predicted as a block is: what no data determine keeps ten times its sd."""
 
 
 class BlockScores(NamedTuple):
@@ -68,6 +66,7 @@ def block_scores(
     modes: Sequence[Gaussian],
     own: NDArray[np.bool_],
     n_sensors: int,
+    options: DiagnosisOptions = DEFAULT,
 ) -> BlockScores:
     """Return the scores of the sensors' gains, and then of all blocks of all recordings, in the order of these.
 
@@ -83,6 +82,8 @@ def block_scores(
         Which gains and parameters each recording has for itself.
     n_sensors
         Number of the sensors' gains, the first of all.
+    options
+        Of `gain_left_out`.
     """
     free = np.diag(priors[0].covariance) > 0.0
     is_own, R = (
@@ -93,7 +94,7 @@ def block_scores(
     columns = [np.where(is_own, np.cumsum(is_own) - 1 + i * n, np.cumsum(~is_own) - 1 + R * n) for i in range(R)]
     precision, slope = np.zeros((R * n + shared,) * 2), np.zeros(R * n + shared)
     blocks = [_blocks(parts, mode, free) for parts, mode in zip(records, modes, strict=True)]
-    of_gains = _gain_blocks(priors[0], modes[0], free, n_sensors, R)
+    of_gains = _gain_blocks(priors[0], modes[0], free, n_sensors, R, options.gain_left_out)
     for at, prior, mode, (_, gradient, information, _) in zip(columns, priors, modes, blocks, strict=True):
         of_prior = np.linalg.inv(prior.covariance[np.ix_(free, free)])
         precision[np.ix_(at, at)] += of_prior + information.sum(0)
@@ -133,15 +134,15 @@ def _blocks(parts: tuple[Part, Part], mode: Gaussian, free: NDArray[np.bool_]) -
 
 
 def _gain_blocks(
-    prior: Gaussian, mode: Gaussian, free: NDArray[np.bool_], n_sensors: int, R: int
+    prior: Gaussian, mode: Gaussian, free: NDArray[np.bool_], n_sensors: int, R: int, left_out: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the same as `_blocks` of the prior of each sensor's gain, of which a recording has the R-th part."""
+    """Return the same as `_blocks` of this share of each sensor's gain's prior; a recording has the R-th part of it."""
     first = len(free) - len(prior.gains)
     gains = np.flatnonzero(free[first : first + n_sensors])
     at = np.searchsorted(np.flatnonzero(free), first + gains)
     covariance = prior.covariance[np.ix_(first + gains, first + gains)] / R
     jacobian, residual = np.zeros((n_sensors, int(free.sum()))), np.zeros(n_sensors)
-    whitened = GAIN_LEFT_OUT**0.5 * np.linalg.inv(np.linalg.cholesky(covariance))
+    whitened = left_out**0.5 * np.linalg.inv(np.linalg.cholesky(covariance))
     jacobian[gains[:, None], at] = whitened
     residual[gains] = whitened @ (mode.gains - prior.gains)[gains]
     return residual**2, jacobian * residual[:, None], np.einsum("bi,bj->bij", jacobian, jacobian), np.zeros(n_sensors)

@@ -125,7 +125,7 @@ def diagnose(
     options = records[0].options
     full = FitCache(records, prior, options)
     base = full.fit(records[0].training.effects)
-    for _ in range(2):  # as each kind's noise depends on that of the others
+    for _ in range(options.noise_rounds):
         if base is not None:
             full, base = weighed(full, base, base)
     if base is None:

@@ -20,6 +20,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.diagnosis.blocks import BlockScores, Part, block_scores
 from soilbus.diagnosis.joint_fit import Start, fit_jointly, own_gains, priors_of
+from soilbus.diagnosis.options import DEFAULT, DiagnosisOptions
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.linearisation import RESIDUAL, Latents, Linearisation
@@ -34,8 +35,6 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
 _SOIL = len(PARAMETERS)
-CHECK_ROUNDS = 3
-"""Linearisations that bring the latents of held-out blocks to their optimum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,7 +321,9 @@ def fit_model(
         return None
     priors, fits = fitted
     checks = [
-        check(record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i])
+        check(
+            record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i], record.options
+        )
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
     parts = [
@@ -332,7 +333,7 @@ def fit_model(
     n_sensors = records[0].training.n_sensors
     own = own_gains(n_sensors, effects, free)
     with np.errstate(all="ignore"):
-        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own, n_sensors)
+        blocks = block_scores(parts, priors, [fit.mode for fit in fits], own, n_sensors, options=records[0].options)
     return FittedModel(tuple(effects), free, free_unheld, priors, tuple(fits), tuple(checks), blocks)
 
 
@@ -352,6 +353,7 @@ def check(
     prior: SoilPrior,
     fit: Fit,
     near: Latents | None = None,
+    options: DiagnosisOptions = DEFAULT,
 ) -> HeldOutCheck:
     """Held-out blocks under a model fitted to the others.
 
@@ -363,7 +365,7 @@ def check(
         latents = objective.start(fit.mode.soil, gains, near).latents
         latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
-        for _ in range(CHECK_ROUNDS - 1):
+        for _ in range(options.check_rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
         quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents), at)

@@ -40,7 +40,7 @@ def noise_factors(records: Sequence[Record], prior: SoilPrior, fitted: FittedMod
     for record, fit in zip(records, fitted.fits, strict=True):
         assert record.bins is not None
         problem = record.bins.with_effects(fitted.effects, fitted.free)
-        at = check(problem, prior, fit).at
+        at = check(problem, prior, fit, options=record.options).at
         values, of_squares, columns = corrections(problem, at, fit.mode.gains)
         for kind, own in columns.items():
             value, expected = values[:, own], of_squares[:, own]

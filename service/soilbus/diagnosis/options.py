@@ -30,6 +30,11 @@ class DiagnosisOptions:
     """Length [s] of an instant, the mean that models are fitted to, as the service's: a machine that shakes is steady
     in the mean.  Over 0.1 s shaking passes for effects, and a hardpan and a springing rut under stale stamps are not
     seen."""
+    gain_left_out: float = 0.99
+    """Share [1] of a sensor gain's prior that is predicted as a block is: what no data determine keeps ten times its
+    sd."""
+    noise_rounds: int = 2
+    """Fits [1] after which noise floors are estimated again, as each kind's depends on those of the others."""
 
     max_effects: int = 3
     """Effects that are added at most, and residual terms of a channel.  With 4 no value of the golden diagnoses moves,
@@ -42,6 +47,13 @@ class DiagnosisOptions:
     1 thrown soil is ambiguous in place of named."""
     compared: SolverOptions = field(default_factory=lambda: SolverOptions(step_tolerance=2e-2))
     """Descent of fits that are compared by their objective: 0.02 of -2 log decides nothing."""
+    negligible_fall: float = 1.0
+    """Fall of -2 log posterior or evidence up to which two models are equally good: odds of e^0.5.  With 0 and 4 no
+    value of the golden diagnoses moves, but with 0 a fit that found nothing is not tried from elsewhere."""
+    check_rounds: int = 3
+    """Linearisations that bring the latents of held-out blocks to their optimum.  With 5 eleven values of the golden
+    diagnoses move, with 1 nearly six hundred."""
+
     dominated_fall: float = 200.0
     """-2 log posterior [1] above the best candidate's from which a fit is given up: blocks tell two models of that
     difference apart by three sd, as a half to a third of it is how blocks scatter."""

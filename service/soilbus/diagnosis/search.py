@@ -28,9 +28,6 @@ from soilbus.estimation.options import SolverOptions
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
-NEGLIGIBLE_FALL = 1.0
-"""Fall of -2 log posterior or score up to which two models are equally good: odds of e^0.5."""
-
 
 @dataclass(frozen=True, slots=True)
 class Addition:
@@ -98,7 +95,7 @@ class Search:
             if wider is None or self._falls_short(present, wider):
                 return
             found = self.with_swaps(wider)
-            if found.score > present.score - NEGLIGIBLE_FALL:
+            if found.score > present.score - self.options.negligible_fall:
                 return
             additions = [self.addition(found, effect) for effect in self.added(found)]
             if not gap_of(present).exceeds_noise(self.options) and not self._is_sure(present, additions[-1]):
@@ -129,7 +126,7 @@ class Search:
                 if without is None:
                     continue
                 other = self.best(without)
-                enough = model.score - NEGLIGIBLE_FALL
+                enough = model.score - self.options.negligible_fall
                 if other is not None and other.score < enough:
                     better = other
                 elif self._falls_short(without, model):
@@ -301,7 +298,7 @@ class FitCache:
     def _explains_nothing(self, fit: FittedModel | None, with_fewer: FittedModel | None) -> bool:
         """Whether a model fits no better than one with a subset of its effects: from another start it may."""
         return with_fewer is not None and (
-            fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - NEGLIGIBLE_FALL
+            fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - self.options.negligible_fall
         )
 
 
