@@ -258,7 +258,7 @@ def spread_of(*std: float) -> SigmaPoints:
     return SigmaPoints.of(Posterior(SOILS["loam"], np.diag([*std, *[0.0] * (6 - len(std))]) ** 2))
 
 
-@pytest.mark.parametrize(("axis", "degree"), [(0, 1), (0, 2), (0, 3), (0, 4), (1, 1), (1, 2), (2, 1), (2, 2)])
+@pytest.mark.parametrize(("axis", "degree"), [(0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2)])
 def test_powers_along_an_axis_have_the_moments_of_a_normal(axis, degree):
     points = spread_of(0.3, 0.2, 0.1)
     x = np.log(points.soils / points.soils[0])[:, axis] / (0.3, 0.2, 0.1)[axis]

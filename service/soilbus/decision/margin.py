@@ -30,7 +30,7 @@ class Margin(NamedTuple):
 
     rows (N, 5): time [s], common slip, pull given [N], demand of draft and slope [N] of the last moments, and demand
     that they foresaw `settling_time` later.  since [s]: of the first moment without a gap.  error, checks: sum of
-    squares of what came less what was foreseen, and their number.  calm [s]: the last moment whose trend did not
+    squares of the errors of foreseen demands, and their number.  calm [s]: the last moment whose trend did not
     reach the limit.  cause: what is seen now, empty for nothing.
     time_left [s]: until the capacity falls to the demand, inf where it does not; None where it is not known.
     """
@@ -44,7 +44,7 @@ class Margin(NamedTuple):
     time_left: float | None = None
 
     def afresh(self) -> Margin:
-        """Return the margin without its rows; how well demands were foreseen stays known."""
+        """Return the margin without its rows, but with the errors of foreseen demands."""
         return Margin(error=self.error, checks=self.checks)
 
 
