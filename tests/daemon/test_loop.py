@@ -401,14 +401,8 @@ class Stamped(ScriptedBus):
         for message in self.messages:
             message.timestamp += by if message.timestamp >= start + since else 0.0
 
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        due = self.at[self.next] if self.next < len(self.at) else math.inf
-        if due > self.clock.now + (timeout or 0.0):
-            self.clock.sleep(max(timeout or 0.0, 1e-4))
-            return None
-        self.clock.now = max(self.clock.now, due)
-        self.next += 1
-        return self.messages[self.next - 1]
+    def due(self) -> float:
+        return self.at[self.next] if self.next < len(self.at) else math.inf
 
 
 @pytest.mark.parametrize("by", [-3600.0, 20.0])

@@ -100,10 +100,14 @@ class ScriptedBus:
         self.closed = False
         self.next = 0
 
+    def due(self) -> float:
+        """Return when the next message comes [s]; inf after the last."""
+        return self.messages[self.next].timestamp - self.offset if self.next < len(self.messages) else float("inf")
+
     def recv(self, timeout: float | None = None) -> can.Message | None:
         if self.fail_receive:
             raise self.fail_receive.pop(0)
-        due = self.messages[self.next].timestamp - self.offset if self.next < len(self.messages) else float("inf")
+        due = self.due()
         if due > self.clock.now + (timeout or 0.0):
             self.clock.sleep(max(timeout or 0.0, 1e-4))
             return None
