@@ -45,14 +45,12 @@ def unit_in(column: str) -> str:
 
 def column_database(units: Mapping[str, str]) -> Database:
     """Return the columns of a table as messages, each numbered by its place; `units` by name, "" where not known."""
-    database = Database(strict=False)
-    conversion = BaseConversion.factory(scale=1, offset=0, is_float=True)
+    conversion, messages = BaseConversion.factory(scale=1, offset=0, is_float=True), []
     for number, (column, unit) in enumerate(units.items()):
         signal = Signal(WHOLE, 0, 64, "little_endian", True, conversion=conversion, unit=unit or None)
         is_extended = number >= 1 << 11
-        database.messages.append(Message(number, column, 8, [signal], is_extended_frame=is_extended, strict=False))
-    database.refresh()
-    return database
+        messages.append(Message(number, column, 8, [signal], is_extended_frame=is_extended, strict=False))
+    return Database(messages, strict=False)
 
 
 def mapped_columns(config: Config) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from copy import copy
 from functools import lru_cache
@@ -51,7 +51,7 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
         raise ConfigError(faults)
     if mapped_only and not mapped <= messages.keys():
         return load_databases(config)  # whoever says what is missing may name what is there
-    return _database(message for _, message in messages.values())
+    return Database([message for _, message in messages.values()], strict=False)
 
 
 def checked_messages(config: Config, database: Database) -> frozenset[str]:
@@ -92,12 +92,12 @@ def output_database(config: Config) -> Database:
     if faults := [fault for message in messages for fault in _unlike(message, ours[message.name])]:
         raise ConfigError([f"output.dbc: {name}: {fault}" for fault in faults])
     if config.j1939.address is None:
-        return database if len(messages) == len(database.messages) else _database(messages)
+        return database if len(messages) == len(database.messages) else Database(messages, strict=False)
     for message in messages:
         if not message.is_extended_frame:
             raise ConfigError([f"j1939.address: {message.name} in {name} has an identifier of 11 bits, without one"])
         message.frame_id = message.frame_id & ~0xFF | config.j1939.address
-    return _database(messages)
+    return Database(messages, strict=False)
 
 
 def _unlike(message: Message, ours: Message) -> Iterator[str]:
@@ -111,7 +111,7 @@ def _unlike(message: Message, ours: Message) -> Iterator[str]:
         if lacks := [str(name) for name in (signal.choices or {}).values() if str(name) not in names]:
             yield f"no code for {', '.join(lacks)} in the value table of {message.name}.{signal.name}"
     try:
-        Publisher(_database([message]))
+        Publisher(Database([message], strict=False))
     except ValueError as error:
         yield one_line(error)
 
@@ -163,14 +163,6 @@ def _parsed(text: str) -> Database:
         if _IDENTIFIER.fullmatch(name) is None:  # attributes for long names can hold anything
             said = "letters, digits and _, at most 128 of them, a digit not first"
             raise ValueError(f"the {what} named {shown(name, LONGEST_NAME)}: a name is {said}")
-    return database
-
-
-def _database(messages: Iterable[Message]) -> Database:
-    database = Database(strict=False)
-    for message in messages:
-        database.messages.append(message)
-    database.refresh()
     return database
 
 
