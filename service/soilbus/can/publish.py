@@ -70,11 +70,7 @@ class ValueCodes:
 
     def column(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return `code` of many numbers (N,) at once; nan means not available."""
-        finite = np.isfinite(values)
-        codes = np.rint((np.where(finite, values, self.offset) - self.offset) / self.scale)
-        above = float(self.highest if self.saturates else self.error)
-        codes = np.where(codes > self.highest, above, np.where(codes < self.lowest, float(self.error), codes))
-        return np.where(finite, codes, float(self.not_available)).astype(np.int64)
+        return np.array([self.code(value) for value in values.tolist()], np.int64)
 
 
 def value_codes(signal: Signal) -> ValueCodes:
