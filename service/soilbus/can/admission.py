@@ -18,7 +18,7 @@ from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
 from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, inbox_of, popped
-from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
+from soilbus.can.j1939 import STANDARD_PGNS, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 
 OUT_OF_ORDER = 0.1  # seconds by which a frame may be stamped before an earlier one: drivers hand them over in bunches
@@ -95,11 +95,10 @@ class Admission:
 
     def feed(self, t: float, arbitration_id: int, extended: bool, data: Data, remote: bool = False) -> None:
         """File one data or remote frame received at t [s]; `data` is kept, not copied."""
-        inbox = self._by_key.get(arbitration_id | _EXTENDED if extended else arbitration_id)
+        key = arbitration_id | _EXTENDED if extended else arbitration_id
+        inbox = self._by_key.get(key) or self._inbox_of_group(arbitration_id, extended)
         if inbox is None:
-            inbox = self._inbox_of_group(arbitration_id, extended)
-            if inbox is None:
-                return
+            return
         if not 0.0 <= t - self._earliest <= _FOLLOWS and not self._is_time(inbox, t):
             return
         if t - OUT_OF_ORDER > self._earliest:
@@ -188,12 +187,9 @@ class Admission:
             inbox.forget()
 
     def _open(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> None:
-        batch = None
-        if frames:
-            self.counts.received[inbox.message.name] += len(frames)
-            batch = self._checked_batch(inbox, frames, out)
+        self.counts.received[inbox.message.name] += len(frames) + len(inbox.late)
+        batch = self._checked_batch(inbox, frames, out) if frames else None
         if inbox.late:
-            self.counts.received[inbox.message.name] += len(inbox.late)
             self._refuse(inbox, np.array(inbox.late), Reason.TIME_BACKWARDS, out)
             inbox.late = []
         if batch is None:
@@ -212,7 +208,7 @@ class Admission:
         if len(good) < len(frames):
             self._refuse(inbox, np.array([f[0] for f in frames if len(f[2]) != length]), Reason.WRONG_LENGTH, out)
         if inbox.lock is not None:
-            heard = _of_locked_source(inbox.lock, good)
+            heard = [f for f in good if inbox.lock.admits(f[0], source_of(f[1]))]
             self._refuse_untimed(inbox, len(good) - len(heard), Reason.WRONG_SOURCE)
             if len(heard) < len(good) and inbox.lock.source != inbox.lock.own:
                 self.counts.senders.setdefault(inbox.message.name, set()).update(source_of(f[1]) for f in good)
@@ -259,13 +255,6 @@ def hears_any_source(message: Message, database: Database) -> bool:
         return False
     pgn = pgn_of(message.frame_id)
     return sum(m.is_extended_frame and pgn_of(m.frame_id) == pgn for m in database.messages) == 1
-
-
-def _of_locked_source(lock: SourceLock, frames: list[Frame]) -> list[Frame]:
-    if {source_of(i) for i in {f[1] for f in frames}} == {lock.source}:
-        lock.admits(frames[-1][0], source_of(frames[-1][1]))
-        return frames
-    return [f for f in frames if lock.admits(f[0], source_of(f[1]))]
 
 
 def _judge(

@@ -106,8 +106,7 @@ def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
     if inbox.checksum_byte is None:
         return None
     due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
-    right: Mask = batch.payload[:, inbox.checksum_byte] == due
-    return right
+    return np.asarray(batch.payload[:, inbox.checksum_byte] == due)
 
 
 def time_forward(inbox: Inbox, batch: Batch) -> Mask:
@@ -116,8 +115,7 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask:
     t = np.where(is_time, batch.t, -math.inf)
     newest = np.maximum.accumulate(np.concatenate([[inbox.last_t], t]))
     inbox.last_t = float(newest[-1])
-    forward: Mask = is_time & (t >= newest[:-1])
-    return forward
+    return np.asarray(is_time & (t >= newest[:-1]))
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
@@ -168,15 +166,12 @@ def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:
     """Return False where a frame comes a second time, as its noise would count twice; None where none does."""
     t_before, id_before, data_before = inbox.last_frame
     inbox.last_frame = float(batch.t[-1]), int(batch.ids[-1]), batch.payload[-1].tobytes()
-    t = batch.t
-    if t[0] - t_before >= TWICE and np.count_nonzero(t[1:] - t[:-1] < TWICE) == 0:
+    close = np.diff(batch.t, prepend=t_before) < TWICE
+    if not close.any():
         return None
-    close = np.diff(t, prepend=t_before) < TWICE
-    length = batch.payload.shape[1]
-    first = np.frombuffer(data_before.ljust(length, b"\0"), np.uint8).reshape(1, length)
-    same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)
-    once: Mask = ~(close & same & (batch.ids == np.concatenate([[id_before], batch.ids[:-1]])))
-    return once
+    first = np.frombuffer(data_before or bytes(batch.payload.shape[1]), np.uint8)
+    same = (np.diff(batch.payload, axis=0, prepend=first[None]) == 0).all(axis=1)
+    return np.asarray(~(close & same & (np.diff(batch.ids, prepend=id_before) == 0)))
 
 
 CHECKS: Mapping[Reason, Callable[[Inbox, Batch], Mask | None]] = {

@@ -106,8 +106,7 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
     verdict = np.zeros(len(raw), dtype=np.uint8)
     seen = physical if rule.is_float else raw
     outside = (seen < rule.low) | (seen > rule.high)
-    all_within = not outside.any()
-    if not all_within:
+    if outside.any():
         verdict[outside] = _VERDICT[Reason.OUT_OF_RANGE]
         reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
         for first, reason in zip(rule.bands or (), reasons, strict=False):
@@ -115,8 +114,7 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
     if rule.is_float:
         verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
     for code, reason in rule.special:
-        if not all_within or rule.is_float or rule.low <= code <= rule.high:
-            verdict[raw == code] = _VERDICT[reason]
+        verdict[raw == code] = _VERDICT[reason]
     return verdict
 
 
