@@ -134,8 +134,14 @@ def _slope(facts: Facts) -> Iterator[Finding]:
 
 
 def _yaw(facts: Facts) -> Iterator[Finding]:
-    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster."""
+    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster.
+
+    Without it, only loads and torques of each wheel tell left and right apart.
+    """
     window, rig = facts.window, facts.rig
+    own = {f"{quantity}.{wheel}" for quantity in ("load", "torque") for wheel in rig.wheels}
+    if pairs(rig).size and "yaw_rate" not in facts.mapped and not own <= facts.mapped:
+        raise UndecidableError("left and right wheels cannot be told apart: map signals.yaw_rate and drive curves")
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
         return
     left, right = pairs(rig)
@@ -151,14 +157,6 @@ def _yaw(facts: Facts) -> Iterator[Finding]:
             " and right wheels swapped (the left wheel of an axle comes first)?",
             "yaw_rate",
         )
-
-
-def _sides_open(facts: Facts) -> Iterator[Finding]:
-    """No finding: says where left and right are not told apart."""
-    own = {f"{quantity}.{wheel}" for quantity in ("load", "torque") for wheel in facts.rig.wheels}
-    if pairs(facts.rig).size and "yaw_rate" not in facts.mapped and not own <= facts.mapped:
-        raise UndecidableError("left and right wheels cannot be told apart: map signals.yaw_rate and drive curves")
-    yield from ()
 
 
 def _radius_open(facts: Facts) -> Iterator[Finding]:
@@ -184,5 +182,5 @@ def _radius_open(facts: Facts) -> Iterator[Finding]:
     )
 
 
-MOTION_CHECKS = (_wheel_based, _accelerometer, _slope, _yaw, _sides_open, _radius_open)
+MOTION_CHECKS = (_wheel_based, _accelerometer, _slope, _yaw, _radius_open)
 """Each with the channels that no check before it has named."""

@@ -53,23 +53,17 @@ NO_FRAME, NEVER_AVAILABLE = "no frame of it in the log", "never available"
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Samples (SI, no gear) and refused values of candidate signals by `Message.Signal`; its length [s]."""
+    """Samples (SI, no gear) and refused values of candidate signals by `Message.Signal`; its begin and length [s]."""
 
     columns: Columns
     refused: Counter[str]
+    start: float
     seconds: float
 
-    def mean(self, path: str, edges: Array) -> Array:
-        """Return the means over the bins between edges [s]; nan where there is no sample."""
+    def mean(self, path: str) -> Array:
+        """Return the means over bins from the begin to the end; nan where there is no sample."""
         t, value = self.columns.get(path, (np.empty(0), np.empty(0)))
-        return bin_means(t, value, edges[0], BIN, len(edges) - 1) if len(edges) else np.empty(0)
-
-    @property
-    def edges(self) -> Array:
-        """Edges [s] of bins over the whole recording."""
-        ends = [(t[0], t[-1]) for t, _ in self.columns.values()]
-        start, end = (min(a for a, _ in ends), max(b for _, b in ends)) if ends else (0.0, 0.0)
-        return np.asarray(np.arange(start, end + BIN, BIN))
+        return bin_means(t, value, self.start, BIN, math.ceil(self.seconds / BIN))
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +98,9 @@ def recording_of(found: Iterable[Candidate], database: Database, frames: Iterabl
     refused = Counter[str]()
     for (path, reason), n in by_reason.items():
         refused[path] += n * (reason != Reason.BAD_TIME)
-    ends = [t for t, _ in columns.values()]
-    seconds = max(float(t[-1]) for t in ends) - min(float(t[0]) for t in ends) if ends else 0.0
-    return Recording(columns, refused, seconds)
+    start = min((float(t[0]) for t, _ in columns.values()), default=0.0)
+    end = max((float(t[-1]) for t, _ in columns.values()), default=0.0)
+    return Recording(columns, refused, start, end - start)
 
 
 def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]:
@@ -129,13 +123,12 @@ def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]
 
 def facts_of(assignment: Assignment, recording: Recording) -> Facts:
     """Return gear ratios, signs, kind of the accelerometer, mass and radii, by the asserted signals."""
-    asserted, edges = assignment.asserted, recording.edges
+    asserted = assignment.asserted
 
     def read(role: str, place: str = "") -> Array:
         c = asserted.get(Slot(role, place))
-        if c is None:
-            return np.full(max(len(edges) - 1, 0), np.nan)
-        return recording.mean(c.path, edges) * (STANDARD_GRAVITY if c.dimension == "mass" else 1.0)
+        factor = STANDARD_GRAVITY if c is not None and c.dimension == "mass" else 1.0
+        return factor * recording.mean("" if c is None else c.path)
 
     ground = read("ground_speed")
     moving = np.abs(ground) > MOVING
@@ -183,15 +176,14 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
 def _turning(found: Iterable[Candidate], recording: Recording) -> Array:
     """A mean of wheels or motors, whose speed each is divided by its own median (bins,)."""
     turns = [c for c in found if c.slot.role in ("speed", "motor_speed") and c.slot.place and c.score >= ASSERTED]
-    edges = recording.edges
-    parts = [recording.mean(path, edges) for path in dict.fromkeys(c.path for c in turns) if path in recording.columns]
+    parts = [recording.mean(path) for path in dict.fromkeys(c.path for c in turns)]
     scaled = [part / size for part in parts if (size := median(np.abs(part))) > 0.0]
-    return np.asarray(np.mean(scaled, axis=0)) if scaled else np.full(max(len(edges) - 1, 0), np.nan)
+    return np.asarray(np.mean(scaled, axis=0)) if scaled else recording.mean("")
 
 
 def _as_ground_speed(c: Candidate, recording: Recording, turning: Array) -> Candidate:
     """A ground speed slips against the wheels; one that does not is computed from them."""
-    ground = np.abs(recording.mean(c.path, recording.edges))
+    ground = np.abs(recording.mean(c.path))
     known = (ground > MOVING) & (np.abs(turning) > 0.1)
     if known.sum() < LEAST_BINS:
         return c
