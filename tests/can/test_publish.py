@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from soilbus.can.publish import Publisher, value_codes
+from soilbus.can.publish import Publisher, ValueCodes
 
 DBC = Path(__file__).resolve().parents[2] / "dbc" / "soilbus.dbc"
 DATABASE = cantools.database.load_file(DBC)
@@ -177,7 +177,7 @@ BO_ 100 M: 8 A
 
 def test_codes_of_a_foreign_dbc_follow_the_habits_of_the_field():
     message = cantools.database.load_string(FOREIGN, "dbc").messages[0]
-    codes = {signal.name: value_codes(signal) for signal in message.signals}
+    codes = {signal.name: ValueCodes(signal) for signal in message.signals}
     assert codes["Plain"].code(None) == -32768
     assert codes["Plain"].code(-1638.35) == -32767
     assert (codes["Plain"].lowest, codes["Plain"].highest) == (-32767, 32767)
@@ -190,6 +190,6 @@ def test_codes_of_a_foreign_dbc_follow_the_habits_of_the_field():
 
 @given(st.sampled_from(SENT), st.lists(NUMBERS, min_size=1, max_size=20))
 def test_columns_and_single_values_get_the_same_codes(sent, values):
-    codes = value_codes(sent[1])
+    codes = ValueCodes(sent[1])
     column = codes.column(np.array(values, float))
     assert column.tolist() == [codes.code(float(value)) for value in values]

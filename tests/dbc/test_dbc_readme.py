@@ -10,7 +10,7 @@ import cantools
 import pytest
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.can.publish import Publisher, value_codes
+from soilbus.can.publish import Publisher, ValueCodes
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 
@@ -77,7 +77,7 @@ def test_codes_by_width_are_those_of_the_signals():
     for length, (highest, error, _) in table.items():
         assert highest == error - 1 if length < 8 else highest + 1 == 0xFB << length - 8
     for length, signal in used.items():
-        codes = value_codes(signal)
+        codes = ValueCodes(signal)
         assert codes.highest <= table[length][0]
         assert (codes.error, codes.not_available) == table[length][1:]
 

@@ -23,7 +23,7 @@ from cantools.database.can import Message, Signal
 
 from availability import unavailable
 from soilbus.can.checksum import frame_checksum
-from soilbus.can.publish import Frame, Publisher, value_codes
+from soilbus.can.publish import Frame, Publisher, ValueCodes
 
 REPO = Path(__file__).resolve().parents[2]
 DBC = REPO / "dbc"
@@ -92,13 +92,13 @@ def assert_same(line: Line, frame: Frame) -> None:
     raw = message.decode(frame.data, scaling=False, decode_choices=False)
     decoded = message.decode(frame.data, decode_choices=False)
     if message.name == "TractionLimits":  # the page's max_draft
-        codes = value_codes(message.get_signal_by_name("MaxDraft"))
+        codes = ValueCodes(message.get_signal_by_name("MaxDraft"))
         is_known = codes.lowest <= raw["MaxDraft"] <= codes.highest and raw["Status"] == codes_of_status()["valid"]
         assert line.values == (f"{decoded['MaxDraft']:.17g}" if is_known else "none",)
         return
     for signal, said in zip(values_of(message), line.values, strict=True):
         name = str(signal.choices.get(raw[signal.name]))
-        codes = value_codes(signal)
+        codes = ValueCodes(signal)
         if name in ("error", "not_available"):
             assert said == name, signal.name
         elif codes.lowest <= raw[signal.name] <= codes.highest:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.can.checksum import checkable_byte, column_checksums
 from soilbus.can.decode import ColumnDecoder
-from soilbus.can.publish import value_codes
+from soilbus.can.publish import ValueCodes
 
 Frame = tuple[float, int, bool, bytes]
 Since = NDArray[np.bool_]
@@ -41,7 +41,7 @@ class Stream:
         return Stream(self.message, self.t[self.t < t], self.payload[self.t < t])
 
     def with_values(self, name: str, values: Array, where: Since) -> Stream:
-        codes = value_codes(self.message.get_signal_by_name(name)).column(values)
+        codes = ValueCodes(self.message.get_signal_by_name(name)).column(values)
         return self.with_codes(name, codes, where)
 
     def with_codes(self, name: str, codes: NDArray[np.int64], where: Since) -> Stream:

@@ -17,9 +17,10 @@ from cantools.database.can import Database, Message
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
-from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, inbox_of, popped
+from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, popped
 from soilbus.can.j1939 import STANDARD_PGNS, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
+from soilbus.grouping import grouped
 
 OUT_OF_ORDER = 0.1  # seconds by which a frame may be stamped before an earlier one: drivers hand them over in bunches
 CLOCK_STEP = 1.0  # the same, above which the clock was set and the new time is believed
@@ -78,13 +79,10 @@ class Admission:
         self.at_break: Callable[[], None] = lambda: None
         self._earliest = math.inf  # an earlier stamp is out of order; inf: there is none yet
         self._untimed: Counter[Reason] = Counter()
-        by_message: dict[str, list[Channel]] = {}
-        for channel in channels:
-            by_message.setdefault(channel.message, []).append(channel)
-        for name, members in by_message.items():
+        for name, members in grouped(channels, lambda channel: channel.message).items():
             message = database.get_message_by_name(name)
             is_open = hears_any_source(message, database)
-            inbox = inbox_of(message, members, is_open, name in checked)
+            inbox = Inbox(message, members, is_open, name in checked)
             key = _key(message.frame_id, message.is_extended_frame)
             if key in self._by_key:
                 raise ValueError(f"{name}: another mapped message has the identifier {message.frame_id:#x} too")

@@ -91,7 +91,12 @@ def _log_line(line: str) -> str:
     if found is None:
         return line
     is_error = int(found["id"], 16) & _ERROR_FLAG
-    head = f"({_seconds(found)}) {found['channel']} {_ERROR_ID if is_error else found['id']}#"
+    stamp = found["time"]
+    if found["date"]:
+        clock, _, part = stamp.partition(".")
+        day = datetime.strptime(f"{found['date'].strip()} {clock}", "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        stamp = f"{int(day.timestamp())}.{part or '0'}"
+    head = f"({stamp}) {found['channel']} {_ERROR_ID if is_error else found['id']}#"
     if found.re is _LOG_LINE:
         return head + found["rest"] if found["date"] or is_error else line
     length, rest = int(found["length"]), found["rest"].split()
@@ -102,12 +107,3 @@ def _log_line(line: str) -> str:
         raise ValueError(f"a frame of {length} bytes has {len(data) // 2}")
     is_fd = len(found["length"]) == 2  # its flags are not printed
     return f"{head}{'#0' * is_fd}{data}\n"
-
-
-def _seconds(found: re.Match[str]) -> str:
-    """The stamp [s] of a line, as text."""
-    if not found["date"]:
-        return found["time"]
-    clock, _, part = found["time"].partition(".")
-    day = datetime.strptime(f"{found['date'].strip()} {clock}", "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-    return f"{int(day.timestamp())}.{part or '0'}"

@@ -53,7 +53,9 @@ class ColumnDecoder:
                     above = columns[signal.multiplexer_signal]
                     present = np.isin(above.physical, list(signal.multiplexer_ids or ()))
                     present = present if above.present is None else present & above.present
-                columns[signal.name] = SignalColumn(raw, _scaled(signal, raw), present)
+                scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
+                physical = raw if (scale, offset) == (1.0, 0.0) else raw.astype(np.float64) * scale + offset
+                columns[signal.name] = SignalColumn(raw, physical, present)
         return columns
 
 
@@ -114,11 +116,3 @@ def _codes(payload: Payload, signal: Signal, first: int) -> NDArray[Any]:
     if is_float:
         return codes.astype(_FLOAT_BITS[length]).view(_FLOATS[length]).astype(np.float64)
     return codes if length == 64 and not signal.is_signed else codes.view(np.int64)
-
-
-def _scaled(signal: Signal, codes: NDArray[Any]) -> NDArray[Any]:
-    """Physical values (N,) of a signal."""
-    scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
-    if scale == 1.0 and offset == 0.0:
-        return codes
-    return codes.astype(np.float64) * scale + offset

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from cantools.database.can import Message
@@ -18,13 +18,11 @@ from soilbus.can.channels import Channel, Reason
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
 from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
-from soilbus.can.validity import CodeRule, rule_of
+from soilbus.can.validity import rule_of
 
 TWICE = 0.002  # seconds within which a frame that equals the one before it is that frame once more: cycles are longer
 
 COUNTER_ERRORS = 5  # net errors of a counter [frames] from which its message is not trusted (opendbc, MAX_BAD_COUNTER)
-
-_NO_FRAME = (-math.inf, -1, b"")
 
 Data = bytes | bytearray
 Frame = tuple[float, int, Data]
@@ -50,49 +48,37 @@ class Batch:
         return Batch(self.t[mask], self.ids[mask], self.payload[mask])
 
 
-@dataclass(slots=True)
 class Inbox:
-    """Inbox of one message: frames not yet taken, and what is remembered between batches."""
+    """Inbox of one message: frames not yet taken, and what is remembered between batches.
 
-    message: Message
-    channels: tuple[Channel, ...]
-    rules: tuple[CodeRule, ...]
-    decoder: ColumnDecoder
-    lock: SourceLock | None
-    checksum_byte: int | None
-    frames: list[Frame] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)  # stamps [s] of frames that came after much later ones
-    last_t: float = -math.inf
-    last_id: int = -1
-    last_counter: int = -1
-    last_data: bytes = b""
-    counter_errors: int = 0  # frames whose counter did not go on by one, less those whose did, to COUNTER_ERRORS
-    is_untrusted: bool = False  # whether the errors have reached COUNTER_ERRORS and are not back at 0 yet
-    untrusted: Mask | None = None  # which frames of the last batch came while the message was not trusted
-    last_frame: tuple[float, int, bytes] = _NO_FRAME
-    missed: int = 0  # frames that the counters of a checked message skip: lost, or refused for their checksum
+    `is_open`: it hears any source.  ValueError where a message cannot be checked.
+    """
+
+    def __init__(self, message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> None:
+        self.message, self.channels = message, channels
+        self.checksum_byte = checkable_byte(message) if checked else None
+        if checked and self.checksum_byte is None:
+            raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
+        wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
+        self.decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
+        is_standard = message.is_extended_frame and pgn_of(message.frame_id) in STANDARD_PGNS
+        self.rules = [rule_of(message.get_signal_by_name(c.signal), is_standard) for c in channels]
+        own, cycle_time = source_of(message.frame_id), (message.cycle_time or 0) / 1e3
+        self.lock = SourceLock.at_cycle(own, cycle_time) if is_open else None
+        self.missed = 0  # frames that the counters of a checked message skip: lost, or refused for their checksum
+        self.untrusted: Mask | None = None  # which frames of the last batch came while the message was not trusted
+        self.forget()
 
     def forget(self) -> None:
         """Forget all frames of this message, and its last stamp, counter and sender."""
-        self.frames.clear()
-        self.late.clear()
-        self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
-        self.last_data, self.counter_errors, self.is_untrusted = b"", 0, False
+        self.frames: list[Frame] = []
+        self.late: list[float] = []  # stamps [s] of frames that came after much later ones
+        self.last_t, self.last_id, self.last_counter, self.last_data = -math.inf, -1, -1, b""
+        self.last_frame = -math.inf, -1, b""
+        self.counter_errors = 0  # frames whose counter did not go on by one, less those whose did, to COUNTER_ERRORS
+        self.is_untrusted = False  # whether the errors have reached COUNTER_ERRORS and are not back at 0 yet
         if self.lock is not None:
             self.lock.release()
-
-
-def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> Inbox:
-    """Return an empty inbox; `is_open`: it hears any source.  ValueError where a message cannot be checked."""
-    place = checkable_byte(message) if checked else None
-    if checked and place is None:
-        raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
-    wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
-    decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
-    is_standard = message.is_extended_frame and pgn_of(message.frame_id) in STANDARD_PGNS
-    rules = tuple(rule_of(message.get_signal_by_name(c.signal), is_standard) for c in channels)
-    lock = SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None
-    return Inbox(message, tuple(channels), rules, decoder, lock, place)
 
 
 def popped(inbox: Inbox, until: float) -> list[Frame]:

@@ -32,23 +32,40 @@ class Frame:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
 class ValueCodes:
-    """Conversion of values of one integer signal to raw codes: physical value = scale * code + offset.
+    """Conversion of values of one signal of any maker's DBC to raw codes: physical value = scale * code + offset.
 
     Valid codes are lowest..highest.  None and what is not finite become `not_available`.  A value outside the range
     becomes `error`, never the nearest valid one, which would be taken for a measurement; but signals with the attribute
     `Saturates` (deviations, ages, counts: "this much or more") stay at the top.  `names` is the value table.
+
+    Without names in the value table, not available is the most negative code of a signed signal and all ones of an
+    unsigned one; error is the J1939 code where the range leaves it free, else not available.
     """
 
-    lowest: int
-    highest: int
-    not_available: int
-    error: int
-    scale: float
-    offset: float
-    saturates: bool
-    names: Mapping[str, int]
+    def __init__(self, signal: Signal) -> None:
+        """Raises ValueError for a signal that cannot be sent."""
+        if signal.is_float or signal.length > 32:
+            raise ValueError(f"{signal.name}: only integer signals up to 32 bits can be sent")
+        least, greatest = code_limits(signal)
+        self.names: Mapping[str, int] = {str(name): int(code) for code, name in (signal.choices or {}).items()}
+        if wide := [name for name, code in self.names.items() if not least <= code <= greatest]:
+            named = f"{', '.join(wide)} of the value table"
+            raise ValueError(f"{signal.name}: {named} does not fit into {signal.length} bits")
+        self.not_available = self.names.get(NOT_AVAILABLE, least if signal.is_signed else greatest)
+        self.scale, self.offset = float(signal.scale), float(signal.offset)
+        bounds = (signal.minimum, signal.maximum)
+        ends = [None if bound is None else round((bound - signal.offset) / signal.scale) for bound in bounds]
+        low, high = reversed(ends) if self.scale < 0.0 else ends
+        self.lowest = least if low is None else max(low, least)
+        self.highest = greatest if high is None else min(high, greatest)
+        if NOT_AVAILABLE not in self.names and signal.length >= 8:  # a range of all codes means all but this one
+            self.lowest += self.lowest == self.not_available
+            self.highest -= self.highest == self.not_available
+        free = 0xFE << signal.length - 8 if signal.length >= 8 and not signal.is_signed else greatest
+        self.error = self.names.get(ERROR, free if self.highest < free < greatest else self.not_available)
+        attributes = signal.dbc.attributes if signal.dbc else {}
+        self.saturates = "Saturates" in attributes and bool(int(attributes["Saturates"].value))
 
     def code(self, value: Any) -> int:
         """Return the raw code of a number, a name of the value table, or None; else ValueError or TypeError."""
@@ -73,45 +90,26 @@ class ValueCodes:
         return np.array([self.code(value) for value in values.tolist()], np.int64)
 
 
-def value_codes(signal: Signal) -> ValueCodes:
-    """Return the conversion for a signal of any maker's DBC; ValueError where it cannot be sent.
-
-    Without names in the value table, not available is the most negative code of a signed signal and all ones of an
-    unsigned one; error is the J1939 code where the range leaves it free, else not available.
-    """
-    if signal.is_float or signal.length > 32:
-        raise ValueError(f"{signal.name}: only integer signals up to 32 bits can be sent")
-    least, greatest = code_limits(signal)
-    names = {str(name): int(code) for code, name in (signal.choices or {}).items()}
-    if wide := [name for name, code in names.items() if not least <= code <= greatest]:
-        raise ValueError(f"{signal.name}: {', '.join(wide)} of the value table does not fit into {signal.length} bits")
-    not_available = names.get(NOT_AVAILABLE, least if signal.is_signed else greatest)
-    bounds = (signal.minimum, signal.maximum)
-    ends = [None if bound is None else round((bound - signal.offset) / signal.scale) for bound in bounds]
-    low, high = reversed(ends) if signal.scale < 0 else ends
-    lowest, highest = least if low is None else max(low, least), greatest if high is None else min(high, greatest)
-    if NOT_AVAILABLE not in names and signal.length >= 8:  # a range of all codes means all but this one
-        lowest, highest = lowest + (lowest == not_available), highest - (highest == not_available)
-    free = 0xFE << signal.length - 8 if signal.length >= 8 and not signal.is_signed else greatest
-    error = names.get(ERROR, free if highest < free < greatest else not_available)
-    attributes = signal.dbc.attributes if signal.dbc else {}
-    saturates = "Saturates" in attributes and bool(int(attributes["Saturates"].value))
-    return ValueCodes(
-        lowest, highest, not_available, error, float(signal.scale), float(signal.offset), saturates, names
-    )
-
-
-@dataclass(slots=True)
 class _Layout:
     """One message, what its signals are filled with, and where its counter stands."""
 
-    message: Message
-    cycle_time: float
-    codes: dict[str, ValueCodes]
-    blank: dict[str, int]
-    counter_modulus: int
-    checksum_byte: int | None
-    sent: int = 0
+    def __init__(self, message: Message) -> None:
+        if message.cycle_time is None:
+            raise ValueError(f"{message.name}: no cycle time (attribute GenMsgCycleTime)")
+        if message.is_multiplexed():
+            raise ValueError(f"{message.name}: multiplexed messages cannot be sent")
+        self.message, self.cycle_time, self.sent = message, message.cycle_time / 1000.0, 0
+        by_name = {signal.name: signal for signal in message.signals}
+        guards = [name for name in (COUNTER, CHECKSUM) if name in by_name]
+        try:
+            self.codes = {name: ValueCodes(signal) for name, signal in by_name.items() if name not in guards}
+        except ValueError as error:
+            raise ValueError(f"{message.name}.{error}") from None
+        self.blank = {name: code.not_available for name, code in self.codes.items()} | dict.fromkeys(guards, 0)
+        self.counter_modulus = 1 << by_name[COUNTER].length if COUNTER in by_name else 0
+        self.checksum_byte = checksum_byte(message)
+        if self.checksum_byte is None and CHECKSUM in by_name:
+            raise ValueError(f"{message.name}: {CHECKSUM} must be one whole byte")
 
 
 class Publisher:
@@ -119,7 +117,7 @@ class Publisher:
 
     def __init__(self, database: Database) -> None:
         """Raises ValueError for a message without cycle time or with a signal it cannot fill."""
-        self._layouts = {message.name: _layout(message) for message in database.messages}
+        self._layouts = {message.name: _Layout(message) for message in database.messages}
         self.schedule = {name: layout.cycle_time for name, layout in self._layouts.items()}
         """Cycle time [s] by message name, from the DBC's attribute GenMsgCycleTime."""
 
@@ -145,22 +143,3 @@ class Publisher:
         if place is not None:
             data = data[:place] + bytes((frame_checksum(frame_id, data, place),)) + data[place + 1 :]
         return Frame(frame_id, layout.message.is_extended_frame, data)
-
-
-def _layout(message: Message) -> _Layout:
-    if message.cycle_time is None:
-        raise ValueError(f"{message.name}: no cycle time (attribute GenMsgCycleTime)")
-    if message.is_multiplexed():
-        raise ValueError(f"{message.name}: multiplexed messages cannot be sent")
-    by_name = {signal.name: signal for signal in message.signals}
-    try:
-        codes = {name: value_codes(signal) for name, signal in by_name.items() if name not in (COUNTER, CHECKSUM)}
-    except ValueError as error:
-        raise ValueError(f"{message.name}.{error}") from None
-    blank = {name: code.not_available for name, code in codes.items()}
-    blank |= {name: 0 for name in (COUNTER, CHECKSUM) if name in by_name}
-    modulus = 1 << by_name[COUNTER].length if COUNTER in by_name else 0
-    place = checksum_byte(message)
-    if place is None and CHECKSUM in by_name:
-        raise ValueError(f"{message.name}: {CHECKSUM} must be one whole byte")
-    return _Layout(message, message.cycle_time / 1000.0, codes, blank, modulus, place)

@@ -49,34 +49,34 @@ class Resolution(NamedTuple):
     rests_at_zero: bool
 
 
-class ConsistencyInput(NamedTuple):
-    """Window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
+class ConsistencyInput:
+    """Window of N bins of length `bin` [s] as the checks see it: driving (N,), slip and traction (N, W).
 
     window has values of every wheel (`instrumentation.completed`), raw the channels alone.  traction is torque over
     load and radius; slip is nan unless the vehicle drives straight on.  motor_speed [rad/s] (N, W) is at the wheel's
-    side of the gear.
+    side of the gear.  A contradiction must last for `sustained` bins, over which values change; `compared` changes are
+    compared with each other.
     """
 
-    window: Window
-    raw: Window
-    rig: Rig
-    bin: float
-    driving: Mask
-    slip: Array
-    traction: Array
-    motor_speed: Array
-    resolution: Mapping[str, Resolution]
-    options: ConsistencyOptions
-
-    @property
-    def sustained(self) -> int:
-        """Bins for which a contradiction must last, and over which changes are compared."""
-        return max(round(self.options.comparison_time / 3.0 / self.bin), 1)
-
-    @property
-    def compared(self) -> int:
-        """Bins of changes that are compared with each other."""
-        return max(round(self.options.comparison_time / self.bin), 1)
+    def __init__(
+        self,
+        raw: Window,
+        motor_speed: Array,
+        rig: Rig,
+        settings: Estimator,
+        resolution: Mapping[str, Resolution],
+        options: ConsistencyOptions,
+    ) -> None:
+        self.raw, self.motor_speed, self.rig, self.resolution, self.options = raw, motor_speed, rig, resolution, options
+        self.window, self.bin = completed(raw, rig), settings.bin
+        self.driving = (self.window.ground_speed > settings.min_speed) & ~turning(self.window, rig, settings.max_turn)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            grip = self.window.torque / (rig.radius * self.window.load)
+        self.traction = np.where(self.window.load > 0.0, grip, np.nan)
+        ground = np.where(self.driving, self.window.ground_speed, np.nan)[:, None]
+        self.slip: Array = slip_ratio(rig.radius, self.window.speed, ground)
+        bins = options.comparison_time / settings.bin
+        self.sustained, self.compared = max(round(bins / 3.0), 1), max(round(bins), 1)
 
 
 class SensorConsistency:
@@ -141,17 +141,8 @@ def implausible(
     resolution: by channel name; motor_speed: [rad/s] (N, W), nan where unknown, named as "motor_speed.FL".
     """
 
-    def seen(raw: Window, motor: Array) -> ConsistencyInput:
-        window = completed(raw, rig)
-        driving = (window.ground_speed > settings.min_speed) & ~turning(window, rig, settings.max_turn)
-        ground = np.where(driving, window.ground_speed, np.nan)[:, None]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
-        slip = slip_ratio(rig.radius, window.speed, ground)
-        return ConsistencyInput(window, raw, rig, settings.bin, driving, slip, traction, motor, resolution, options)
-
     motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
-    data = seen(window, motor)
+    data = ConsistencyInput(window, motor, rig, settings, resolution, options)
     if not data.driving.any():
         return ()
     named: set[str] = set()
@@ -160,21 +151,20 @@ def implausible(
             named |= found
             window = without(window, rig, found)
             motor = np.where([f"motor_speed.{w}" in found for w in rig.wheels], np.nan, motor)
-            data = seen(window, motor)
+            data = ConsistencyInput(window, motor, rig, settings, resolution, options)
     order = (*rig.channels, *(f"motor_speed.{w}" for w in rig.wheels))
     return tuple(name for name in order if name in named)
 
 
 def without(window: Window, rig: Rig, channels: set[str]) -> Window:
     """Return the window without any reading of these channels."""
-    values: dict[str, Array] = {}
+    values: dict[str, Any] = {}
     for i, name in enumerate(rig.channels):
         if name in channels:
             quantity, _, wheel = name.partition(".")
             values.setdefault(quantity, getattr(window, quantity).copy())
             values[quantity][..., i % len(rig.wheels) if wheel else slice(None)] = np.nan
-    changed: dict[str, Any] = values
-    return replace(window, **changed) if changed else window
+    return replace(window, **values) if values else window
 
 
 def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:

@@ -13,7 +13,7 @@ import can
 from cantools.database import Database
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, frame_checksum
-from soilbus.can.publish import value_codes
+from soilbus.can.publish import ValueCodes
 from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config
 from soilbus.simulator.drive import Command
@@ -37,7 +37,7 @@ class Commands:
         database.add_dbc_file(str(shipped_dbc("tractor.dbc")))
         self._messages = {m.frame_id: m for m in map(database.get_message_by_name, (_DRIVE, _TORQUE_LIMIT))}
         self._codes = {
-            i: {s.name: value_codes(s) for s in m.signals if s.name not in (COUNTER, CHECKSUM)}
+            i: {s.name: ValueCodes(s) for s in m.signals if s.name not in (COUNTER, CHECKSUM)}
             for i, m in self._messages.items()
         }
         self._counter: dict[int, int] = {}

@@ -24,7 +24,7 @@ from soilbus.can.channels import Channel, Column
 from soilbus.can.checksum import COUNTER, checksum_byte, column_checksums
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
-from soilbus.can.publish import value_codes
+from soilbus.can.publish import ValueCodes
 from soilbus.config.model import Config
 from soilbus.grouping import grouped
 from soilbus.simulator.recording import Recording
@@ -164,7 +164,7 @@ def _raw_codes(
     codes: dict[str, NDArray[np.int64]] = {}
     for signal in message.signals:
         if signal.name in values:
-            codes[signal.name] = value_codes(signal).column(values[signal.name])
+            codes[signal.name] = ValueCodes(signal).column(values[signal.name])
     for channel in channels:
         if channel.valid_signal is not None and channel.valid_values:
             codes[channel.valid_signal] = np.full(n_frames, channel.valid_values[0])
