@@ -6,8 +6,7 @@ import can
 import pytest
 
 from fakes import FakeClock, ScriptedBus
-from soilbus.can.bus import LiveBus
-from soilbus.can.bus_state import BusState, state_told, tells_overflow
+from soilbus.can.bus import BusState, LiveBus, state_told, tells_overflow
 
 CONTROLLER, PROTOCOL, NO_ACK, BUS_OFF, BUS_ERROR, RESTARTED, COUNTERS = 0x4, 0x8, 0x20, 0x40, 0x80, 0x100, 0x200
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.can.dbc_files import load_databases
-from soilbus.can.dbc_text import of_messages
+from soilbus.can.dbc_files import load_databases, of_messages
 from soilbus.can.mapping import channels_of
 from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import ConfigError

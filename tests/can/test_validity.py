@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.decode import SignalColumn
-from soilbus.can.validity import in_si, judge_codes, judge_validity, meaning, rule_of
+from soilbus.can.validity import CodeRule, in_si, judge_codes, judge_validity, meaning
 
 SPEED_MAX = 64.255
 NA, ERROR, RESERVED, OUT = Reason.NOT_AVAILABLE, Reason.ERROR, Reason.RESERVED, Reason.OUT_OF_RANGE
@@ -31,7 +31,7 @@ def signal(length: int = 16, **more: Any) -> Signal:
 def verdicts(s: Signal, codes: list[Any]) -> list[Reason | None]:
     raw = np.array(codes)
     physical = np.array([s.conversion.raw_to_scaled(c, False) for c in codes])
-    return reasons(judge_codes(rule_of(s), raw, physical))
+    return reasons(judge_codes(CodeRule(s), raw, physical))
 
 
 def reasons(verdict: Any) -> list[Reason | None]:

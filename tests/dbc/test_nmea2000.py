@@ -11,7 +11,7 @@ import pytest
 from soilbus.can.channels import Reason
 from soilbus.can.decode import ColumnDecoder
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
-from soilbus.can.validity import judge_codes, rule_of
+from soilbus.can.validity import CodeRule, judge_codes
 
 DATABASE = cantools.database.load_file(Path(__file__).resolve().parents[2] / "dbc/nmea2000.dbc", strict=True)
 MESSAGE = DATABASE.get_message_by_name("PositionRapidUpdate")
@@ -23,7 +23,7 @@ def verdicts(payload: str) -> list[str]:
         np.frombuffer(bytes.fromhex(payload), np.uint8).reshape(1, 8)
     )
     found = [
-        judge_codes(rule_of(MESSAGE.get_signal_by_name(name)), columns[name].raw, columns[name].physical)[0]
+        judge_codes(CodeRule(MESSAGE.get_signal_by_name(name)), columns[name].raw, columns[name].physical)[0]
         for name in ("Latitude", "Longitude")
     ]
     return [str([*Reason][v - 1]) if v else "" for v in found]

@@ -12,7 +12,7 @@ from cantools.database.can import Database
 
 from soilbus.can.candump import Frame
 from soilbus.can.role_matching import Assignment, Slot, assigned, candidates
-from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
+from soilbus.sensors.role_evidence import Facts, Recording, facts_of, weighed
 
 GEAR, RADIUS = 24.0, 0.6
 T = np.arange(0.0, 40.0, 0.05)
@@ -58,7 +58,7 @@ def found(text: str, values: Mapping[str, np.ndarray]) -> tuple[Assignment, Fact
     database = Database(strict=False)
     database.add_dbc_string(text)
     known = candidates(database)
-    recording = recording_of(known, database, frames(database, values))
+    recording = Recording(known, database, frames(database, values))
     assignment = assigned(weighed(known, recording))
     return assignment, facts_of(assignment, recording)
 

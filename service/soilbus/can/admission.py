@@ -167,22 +167,18 @@ class Admission:
             self._earliest = -math.inf
         elif t < self._earliest + OUT_OF_ORDER - CLOCK_STEP:
             self.at_break()
-            self._step_clock()
+            self.counts.clock_steps += 1
+            self._earliest = -math.inf
+            for other in self._inboxes:  # what nobody took of the old time has no place in the new one
+                for _ in range(len(other.frames) + len(other.late)):
+                    self._refuse_unheard(other, Reason.TIME_BACKWARDS)
+                other.forget()
         elif t < self._earliest:
             inbox.late.append(t)
             return False
         elif t - self._earliest > _FOLLOWS:
             self.at_break()
         return True
-
-    def _step_clock(self) -> None:
-        """Believe the new time; what nobody took of the old one has no place in it."""
-        self.counts.clock_steps += 1
-        self._earliest = -math.inf
-        for inbox in self._inboxes:
-            for _ in range(len(inbox.frames) + len(inbox.late)):
-                self._refuse_unheard(inbox, Reason.TIME_BACKWARDS)
-            inbox.forget()
 
     def _open(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> None:
         self.counts.received[inbox.message.name] += len(frames) + len(inbox.late)
@@ -203,8 +199,8 @@ class Admission:
         """The frames that pass every frame-level check; None when there are none."""
         length = inbox.message.length
         good = [f for f in frames if len(f[2]) == length]
-        if len(good) < len(frames):
-            self._refuse(inbox, np.array([f[0] for f in frames if len(f[2]) != length]), Reason.WRONG_LENGTH, out)
+        if wrong := [f[0] for f in frames if len(f[2]) != length]:
+            self._refuse(inbox, np.array(wrong), Reason.WRONG_LENGTH, out)
         if inbox.lock is not None:
             heard = [f for f in good if inbox.lock.admits(f[0], source_of(f[1]))]
             self._refuse_untimed(inbox, len(good) - len(heard), Reason.WRONG_SOURCE)
@@ -249,10 +245,8 @@ def _key(arbitration_id: int, extended: bool) -> int:
 
 def hears_any_source(message: Message, database: Database) -> bool:
     """Return whether a message is taken by its parameter group, from any source address."""
-    if not message.is_extended_frame or pgn_of(message.frame_id) not in STANDARD_PGNS:
-        return False
-    pgn = pgn_of(message.frame_id)
-    return sum(m.is_extended_frame and pgn_of(m.frame_id) == pgn for m in database.messages) == 1
+    pgn, groups = pgn_of(message.frame_id), [pgn_of(m.frame_id) for m in database.messages if m.is_extended_frame]
+    return message.is_extended_frame and pgn in STANDARD_PGNS and groups.count(pgn) == 1
 
 
 def _judge(

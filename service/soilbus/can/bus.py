@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import StrEnum
 from importlib.util import find_spec
 from typing import Any
 
 import can
 
 from soilbus.can import candump
-from soilbus.can.bus_state import BusState, state_told, tells_overflow
 from soilbus.can.publish import Frame
 from soilbus.can.wire import MessageBus, MessageWire, Received, error_number, is_multicast, wire_of
 from soilbus.words import WorkError, one_line
@@ -35,6 +35,10 @@ SAY_AGAIN = 60.0  # a fault that lasts is said in the journal this often [s]
 
 _NO_ROOM = {errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK}
 _KERNEL_WITHOUT_CAN = {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT}
+
+# bits of the kernel's linux/can/error.h
+_CONTROLLER, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100  # error classes, in the identifier
+_RX_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x01, 0x0C, 0x30, 0x40  # of the controller, in data[1]
 
 
 class BusError(WorkError):
@@ -98,6 +102,34 @@ def ask_for_buffer(own: socket.socket) -> None:
     own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     with suppress(OSError):  # it takes CAP_NET_ADMIN
         own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
+
+
+class BusState(StrEnum):
+    """Fault confinement state of our controller; those of ISO 11898-1, names as in the DBC."""
+
+    UNKNOWN = "unknown"
+    ACTIVE = "error_active"
+    WARNING = "error_warning"
+    PASSIVE = "error_passive"
+    OFF = "bus_off"
+
+
+def state_told(before: BusState, error_class: int, data: bytes | bytearray) -> BusState:
+    """Return the state after an error frame with this identifier and data; `before` if it tells none."""
+    if error_class & _BUS_OFF:
+        return BusState.OFF
+    if error_class & _RESTARTED:
+        return BusState.ACTIVE
+    status = data[1] if error_class & _CONTROLLER and len(data) > 1 else 0
+    for bits, state in ((_PASSIVE, BusState.PASSIVE), (_WARNING, BusState.WARNING), (_ACTIVE, BusState.ACTIVE)):
+        if status & bits:
+            return state
+    return before
+
+
+def tells_overflow(error_class: int, data: bytes | bytearray) -> bool:
+    """Return whether an error frame says that the controller lost a frame by overflow."""
+    return bool(error_class & _CONTROLLER and len(data) > 1 and data[1] & _RX_OVERFLOW)
 
 
 @dataclass(slots=True)

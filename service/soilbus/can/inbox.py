@@ -18,7 +18,7 @@ from soilbus.can.channels import Channel, Reason
 from soilbus.can.checksum import CHECKSUM, COUNTER, checkable_byte, column_checksums
 from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, pgn_of, source_of
-from soilbus.can.validity import rule_of
+from soilbus.can.validity import CodeRule
 
 TWICE = 0.002  # seconds within which a frame that equals the one before it is that frame once more: cycles are longer
 
@@ -62,7 +62,7 @@ class Inbox:
         wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
         self.decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
         is_standard = message.is_extended_frame and pgn_of(message.frame_id) in STANDARD_PGNS
-        self.rules = [rule_of(message.get_signal_by_name(c.signal), is_standard) for c in channels]
+        self.rules = [CodeRule(message.get_signal_by_name(c.signal), is_standard) for c in channels]
         own, cycle_time = source_of(message.frame_id), (message.cycle_time or 0) / 1e3
         self.lock = SourceLock.at_cycle(own, cycle_time) if is_open else None
         self.missed = 0  # frames that the counters of a checked message skip: lost, or refused for their checksum

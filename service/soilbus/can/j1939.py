@@ -9,10 +9,9 @@ from soilbus.config.model import J1939
 
 __all__ = ["STANDARD_PGNS", "SourceLock", "group_mask", "name_of", "pgn_of", "source_of"]
 
-GROUND_BASED_SPEED = 65097
 STANDARD_PGNS = frozenset(
     {61444, 61449, 61459, 61481, 61482, 61485}  # engine torque, vehicle dynamics, attitude, rates, acceleration
-    | {65093, 65094, 65096, GROUND_BASED_SPEED, 65258, 65265, 65267}  # hitch, speeds, axle weight, position
+    | {65093, 65094, 65096, 65097, 65258, 65265, 65267}  # hitch, speeds, axle weight, position
     | {127251, 127257, 129025, 129026}  # NMEA 2000: rate of turn, attitude, position, speed over ground
 )
 """Groups whose meaning the standards fix, whoever sends them."""

@@ -51,10 +51,9 @@ def format_of(head: bytes) -> Format:
     """Return the format of a log by its first bytes; ValueError says what it is instead."""
     for mark, found in _BINARY.items():
         if head.startswith(mark):
+            if isinstance(found, str):
+                raise ValueError(f"{found}, without CAN frames")
             return found
-    for mark, what in _NO_FRAMES.items():
-        if head.startswith(mark):
-            raise ValueError(f"{what}, without CAN frames")
     is_wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")
     text = head.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -186,16 +185,15 @@ def _busmaster(stream: BufferedReader) -> Iterator[Heard]:
     base, midnight, unwrapped = 16, 0.0, _Clock(DAY)
     in_day = True
     for line in text_lines(stream):
-        if line.startswith("***"):
-            if line.startswith("***DEC"):
-                base = 10
-            elif line.startswith("***RELATIVE MODE"):
-                raise ValueError("its stamps are relative to the frame before: log in system or absolute mode")
-            elif line.startswith("***ABSOLUTE MODE"):
-                in_day = False
-            elif found := _BUSMASTER_DATE.match(line):
-                day, month, year = map(int, found.groups())
-                midnight, unwrapped = datetime(year, month, day, tzinfo=UTC).timestamp(), _Clock(DAY)
+        if line.startswith("***DEC"):
+            base = 10
+        elif line.startswith("***RELATIVE MODE"):
+            raise ValueError("its stamps are relative to the frame before: log in system or absolute mode")
+        elif line.startswith("***ABSOLUTE MODE"):
+            in_day = False
+        elif found := _BUSMASTER_DATE.match(line):
+            day, month, year = map(int, found.groups())
+            midnight, unwrapped = datetime(year, month, day, tzinfo=UTC).timestamp(), _Clock(DAY)
         if line.startswith("***") or not line.strip():
             continue
         stamp, _, channel, identifier, kind, length, *data = line.split()
@@ -338,13 +336,11 @@ def _sqlite(stream: BufferedReader) -> Iterator[Heard]:
             yield of_message(message)
 
 
-_BINARY = {
+_BINARY: Mapping[bytes, Format | str] = {
     b"LOGG": Format("BLF log", _blf),
     b"MDF     4": Format("MF4 log", _mf4),
     b"\x89MCAP": Format("MCAP log", mcap_frames),
     b"SQLite format 3\0": Format("SQLite log of python-can", _sqlite),
-}
-_NO_FRAMES = {
     b"PAR1": "a Parquet table",
     b"UnFinMF ": "an MDF file that was never finished",
     b"MDF     ": "an MDF file of version 3",

@@ -136,10 +136,8 @@ class Log:
         size = self.path.stat().st_size if self.path.is_file() else math.inf
         first = 0.0
         for n, (channel, frame) in enumerate(heard, 1):
-            if n == 1:
-                first = frame[0]
-            if frame[0] - first > self.span:
-                self.span = frame[0] - first
+            first = frame[0] if n == 1 else first
+            self.span = max(self.span, frame[0] - first)
             if channel or not frame[5]:  # candump's reader keeps no channel of error frames
                 self.channels[channel] += 1
             if n % CHANNEL_SCAN_FRAMES == 0:

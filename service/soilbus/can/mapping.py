@@ -264,12 +264,9 @@ def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple
         return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
     if quantity == "sinkage":
         return -0.1 * radius, radius
-    if quantity in ("torque", "torque_limit"):
-        greatest = 2.0 * weight * radius
-    elif quantity in ("speed", "motor_speed"):
-        greatest = MAX_SPEED / radius
-    else:
-        greatest = 2.0 * weight if quantity == "draft" else _GREATEST.get(quantity, math.inf)
+    torque, speed = 2.0 * weight * radius, MAX_SPEED / radius
+    of_wheel = {"torque": torque, "torque_limit": torque, "speed": speed, "motor_speed": speed, "draft": 2.0 * weight}
+    greatest = of_wheel.get(quantity, _GREATEST.get(quantity, math.inf))
     return -greatest, greatest
 
 

@@ -70,8 +70,13 @@ _UNITS = {
     for (dimension, factor), spellings in _SPELLINGS.items()
     for spelling in spellings.split()
 }
-_MEGA_MILLI = {"M": 1e6, "m": 1e-3}
-"""Prefixes of the newton in its units, which their case alone tells apart."""
+_PREFIXED = {
+    prefix + spelling: Unit(unit.dimension, factor * unit.factor)
+    for prefix, factor in (("M", 1e6), ("m", 1e-3))
+    for spelling, unit in _UNITS.items()
+    if spelling.startswith("n")
+}
+"""Units of newtons with mega or milli, which their case alone tells apart; of MNM it says nothing."""
 _SAME_CHARACTER = str.maketrans(
     {"·": ".", "⋅": ".", "∙": ".", "•": ".", "×": "*", "²": "2", "⁻": "-", "¹": "1", "º": "°", "^": ""}
 )
@@ -88,18 +93,10 @@ def unit_of(text: str | None) -> Unit | None:
     tidy = "".join(tidy.split()).removeprefix("[").removesuffix("]")
     if not tidy or tidy in ("-", "1"):
         return None
-    unit = _prefixed(tidy) or _UNITS.get(tidy.casefold())
+    prefix, rest = tidy[:1], tidy[1:].casefold()
+    if prefix + rest in _PREFIXED and len(rest) > 1 and tidy.isupper():
+        raise ValueError(f"unit {tidy} may be mega or milli; write N{rest[1:]} after M or m in the DBC")
+    unit = _PREFIXED.get(prefix + rest) or _UNITS.get(tidy.casefold())
     if unit is None:
         raise ValueError(_WHY_NOT.get(tidy.casefold(), f"unit {text!r} is not known"))
     return unit
-
-
-def _prefixed(tidy: str) -> Unit | None:
-    """The unit of a text with M or m before one of newtons, None for another; of MNM the case says nothing."""
-    prefix, rest = tidy[:1], tidy[1:].casefold()
-    unit = _UNITS.get(rest) if prefix in _MEGA_MILLI and rest.startswith("n") else None
-    if unit is None:
-        return None
-    if len(rest) > 1 and tidy.isupper():
-        raise ValueError(f"unit {tidy} may be mega or milli; write N{rest[1:]} after M or m in the DBC")
-    return Unit(unit.dimension, _MEGA_MILLI[prefix] * unit.factor)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,41 +35,26 @@ _OF_WHAT = re.compile(r"\b(signal|data|values?|status|state|quality|measurement|
 """Words beside a vouching one that change nothing."""
 
 
-@dataclass(frozen=True, slots=True)
 class CodeRule:
-    """Rule which raw codes of a signal carry a value.
+    """Rule which raw codes of a signal carry a value, by its DBC entry.
 
     `low`..`high` are raw codes, of float signals physical values; `bands` the first reserved, error and not-available
-    codes, where the range leaves them out; `special` single codes with a meaning of their own.
+    codes, where the range leaves them out; `special` single codes with a meaning of their own.  In a group of the
+    standards the top codes never are values.
     """
 
-    low: float
-    high: float
-    is_float: bool
-    bands: tuple[int, int, int] | None
-    special: tuple[tuple[int, Reason], ...]
-
-
-def rule_of(signal: Signal, is_standard: bool = False) -> CodeRule:
-    """Return the rule of a signal's DBC entry; in a group of the standards the top codes never are values."""
-    named = tuple((code, reason) for code, name in (signal.choices or {}).items() if (reason := meaning(str(name))))
-    if signal.conversion.is_float:
-        low = -math.inf if signal.minimum is None or not _has_range(signal) else float(signal.minimum)
-        high = math.inf if signal.maximum is None or not _has_range(signal) else float(signal.maximum)
-        # a float32 signal may pass a limit by its own rounding
-        eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
-        return CodeRule(low - eps * abs(low), high + eps * abs(high), True, None, named)
-    first, last = code_limits(signal)
-    least, greatest = _code_range(signal, first, last)
-    special: dict[int, Reason] = {}
-    if signal.length >= 8 and signal.is_signed:
-        special = {first: Reason.NOT_AVAILABLE, last: Reason.SATURATED}
-    elif signal.length >= 8:
-        special = {last: Reason.NOT_AVAILABLE}
-    bands = None if signal.is_signed else _BANDS.get(signal.length)
-    if is_standard and bands is not None:
-        greatest = min(greatest, bands[0] - 1)
-    return CodeRule(least, greatest, False, bands, tuple((special | dict(named)).items()))
+    def __init__(self, signal: Signal, is_standard: bool = False) -> None:
+        self.is_float = signal.conversion.is_float
+        names = signal.choices or {}
+        self.special = {code: reason for code, name in names.items() if (reason := meaning(str(name)))}
+        self.bands = None if self.is_float or signal.is_signed else _BANDS.get(signal.length)
+        self.low, self.high = _range_of(signal)
+        if is_standard and self.bands is not None:
+            self.high = min(self.high, self.bands[0] - 1)
+        if signal.length >= 8 and not self.is_float:
+            first, last = code_limits(signal)
+            top = {first: Reason.NOT_AVAILABLE, last: Reason.SATURATED}
+            self.special = (top if signal.is_signed else {last: Reason.NOT_AVAILABLE}) | self.special
 
 
 def meaning(name: str) -> Reason | None:
@@ -113,7 +97,7 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
             verdict[outside & (raw >= first)] = _VERDICT[reason]
     if rule.is_float:
         verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
-    for code, reason in rule.special:
+    for code, reason in rule.special.items():
         verdict[raw == code] = _VERDICT[reason]
     return verdict
 
@@ -143,20 +127,26 @@ def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArra
     return value
 
 
-def _has_range(signal: Signal) -> bool:
-    return not (signal.minimum == signal.maximum and signal.minimum in (None, 0))
+def _range_of(signal: Signal) -> tuple[float, float]:
+    """Least and greatest raw code within the DBC's range; limits are often printed rounded, so the outer codes.
 
-
-def _code_range(signal: Signal, first: int, last: int) -> tuple[int, int]:
-    """Least and greatest raw code within the DBC's range; limits are often printed rounded, so the outer codes."""
-    scale, offset = signal.scale, signal.offset
-    if not _has_range(signal) or scale == 0:
-        return first, last
+    Of float signals the physical values, which may pass a limit by their own rounding.
+    """
     low, high = signal.minimum, signal.maximum
-    if scale < 0:
+    if low == high and low in (None, 0):
+        low = high = None
+    if signal.conversion.is_float:
+        least, greatest = (-math.inf if low is None else float(low)), (math.inf if high is None else float(high))
+        eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
+        return least - eps * abs(least), greatest + eps * abs(greatest)
+    first, last = code_limits(signal)
+    if signal.scale == 0:
+        return first, last
+    low, high = (None if end is None else (end - signal.offset) / signal.scale for end in (low, high))
+    if signal.scale < 0:
         low, high = high, low
-    least = first if low is None else _outer((low - offset) / scale, math.floor)
-    greatest = last if high is None else _outer((high - offset) / scale, math.ceil)
+    least = first if low is None else _outer(low, math.floor)
+    greatest = last if high is None else _outer(high, math.ceil)
     return max(least, first), min(greatest, last)
 
 

@@ -49,7 +49,7 @@ def init(args: argparse.Namespace) -> None:
     from soilbus.config.file import located, parse_config
     from soilbus.report.progress import progress
     from soilbus.report.proposal import proposal
-    from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
+    from soilbus.sensors.role_evidence import Facts, Recording, facts_of, weighed
 
     to_stdout = str(args.out) == "-"
     if not to_stdout and args.out.exists() and not args.force:
@@ -72,7 +72,7 @@ def init(args: argparse.Namespace) -> None:
     found, facts = candidates(database), Facts()
     if log is not None:
         with progress("init") as step:
-            recording = recording_of(found, database, _counted(log.frames(), step))
+            recording = Recording(found, database, _counted(log.frames(), step))
         if log.note:
             say(log.note)
         if not recording.columns:

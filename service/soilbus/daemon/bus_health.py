@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from soilbus.can.bus import BusCounts
-from soilbus.can.bus_state import BusState
+from soilbus.can.bus import BusCounts, BusState
 
 RECEIVED_MODULUS = 4016
 """The 12-bit count of received frames is 0..4015."""

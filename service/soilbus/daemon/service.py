@@ -20,8 +20,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
-from soilbus.can.bus import SAY_AGAIN, LiveBus
-from soilbus.can.bus_state import BusState
+from soilbus.can.bus import SAY_AGAIN, BusState, LiveBus
 from soilbus.can.doubts import RecentDoubts
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config

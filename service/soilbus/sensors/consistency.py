@@ -85,14 +85,13 @@ class SensorConsistency:
     def __init__(self, rig: Rig, channels: Iterable[Channel], database: Database, settings: Estimator) -> None:
         self._rig, self._settings = rig, settings
         self._resolution = {c.name: resolution_of(c, database) for c in channels}
-        motors = [wheel for wheel in rig.wheels if f"motor_speed.{wheel}" in self._resolution]
-        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in motors}
+        motors = [f"motor_speed.{wheel}" for wheel in rig.wheels]
+        self._heard: dict[str, list[tuple[Array, Array]]] = {name: [] for name in motors if name in self._resolution}
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
         """Keep the motors' speeds among these samples (t [s], value in SI; both (N,)) by channel."""
-        for wheel, heard in self._heard.items():
-            if found := samples.get(f"motor_speed.{wheel}"):
-                heard.append(found)
+        for name in self._heard.keys() & samples.keys():
+            self._heard[name].append(samples[name])
 
     def checked(self, window: Window) -> tuple[Window, tuple[str, ...]]:
         """Return a forward window without the channels that contradict the others, and which these are."""
@@ -101,21 +100,17 @@ class SensorConsistency:
 
     def drop_before(self, t: float) -> None:
         """Forget the speeds of the motors before t [s]."""
-        for wheel, heard in self._heard.items():
-            self._heard[wheel] = [part for part in heard if part[0][-1] >= t]
+        for name, heard in self._heard.items():
+            self._heard[name] = [part for part in heard if part[0][-1] >= t]
 
-    def _motor_speed(self, window: Window) -> Array | None:
+    def _motor_speed(self, window: Window) -> Array:
         """Mean speeds [rad/s] of the motors in the window's bins (N, W), forward; nan where unknown."""
-        if not self._heard or not len(window.t):
-            return None
-        n = len(window.t)
+        length, n = self._settings.bin, len(window.t)
         speed = np.full((n, len(self._rig.wheels)), np.nan)
-        begin = window.t[0] - self._settings.bin / 2.0
-        for wheel, heard in self._heard.items():
-            if not heard:
-                continue
-            t, value = (np.concatenate(parts) for parts in zip(*heard, strict=True))
-            speed[:, self._rig.wheels.index(wheel)] = bin_means(t, np.abs(value), begin, self._settings.bin, n)
+        for i, wheel in enumerate(self._rig.wheels if n else ()):
+            if heard := self._heard.get(f"motor_speed.{wheel}"):
+                t, value = (np.concatenate(parts) for parts in zip(*heard, strict=True))
+                speed[:, i] = bin_means(t, np.abs(value), window.t[0] - length / 2.0, length, n)
         return speed
 
 
@@ -220,22 +215,6 @@ def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolu
     return (samples - 1.0) * math.log(max(same, probability)) < math.log(probability)
 
 
-def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
-    """Yield the speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed if all rest."""
-    window, rig, options = data.window, data.rig, data.options
-    standing = (1.0 - options.usual_share) * window.ground_speed[:, None]
-    with np.errstate(invalid="ignore"):
-        still = data.driving[:, None] & (rig.radius * window.speed < standing)
-        braked = data.traction < -options.driving_traction
-        idle = np.abs(data.traction) < options.idle_traction
-    if lasts(np.logical_and.reduce(still & idle, axis=1), data.sustained):
-        yield "ground_speed"
-        return
-    for i, wheel in enumerate(rig.wheels):
-        if lasts(still[:, i] & ~braked[:, i], data.sustained):
-            yield f"speed.{wheel}"
-
-
 def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
     """Yield the speed that is farther from the other wheels' where a wheel and its motor disagree.
 
@@ -292,20 +271,25 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
 
 
 def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
-    """Yield torques or speeds of wheels that slip without driving, or drive without slipping."""
-    rig, slip, grip, options = data.rig, data.slip, data.traction, data.options
+    """Yield torques or speeds of wheels that slip without driving, or drive without slipping or turning."""
+    window, rig, slip, grip, options = data.window, data.rig, data.slip, data.traction, data.options
     with np.errstate(invalid="ignore"):
         idle = (slip > options.feigned_slip) & (grip < options.idle_traction)
         dragged = (slip < -options.feigned_slip) & (grip > options.driving_traction)
+        still = rig.radius * window.speed < (1.0 - options.usual_share) * window.ground_speed[:, None]
+        stands = data.driving[:, None] & still & ~(grip < -options.driving_traction)  # nor braked
+        rolls = still & (np.abs(grip) < options.idle_traction)
     wheels = range(len(rig.wheels))
-    idles, drags = ([i for i in wheels if lasts(at[:, i], data.sustained)] for at in (idle, dragged))
-    if 2 * len(drags) > len(wheels):
+    idles, drags, stood = ([i for i in wheels if lasts(at[:, i], data.sustained)] for at in (idle, dragged, stands))
+    if 2 * len(drags) > len(wheels) or lasts(np.asarray((stands & rolls).all(axis=1)), data.sustained):
         yield "ground_speed"
         return
+    yield from (f"speed.{rig.wheels[i]}" for i in stood)
     if len(idles) == len(wheels) and not _pulls(data, np.asarray(idle.all(axis=1))):
         yield "ground_speed"  # or the torques: coasting at a ground speed that is reported too low looks the same
     yield from (f"torque.{rig.wheels[i]}" for i in idles)
-    others = [i for i in wheels if i not in {*idles, *drags}]
+    drags = [i for i in drags if i not in stood]
+    others = [i for i in wheels if i not in {*idles, *drags, *stood}]
     for i in drags:
         where = dragged[:, i]
         odd = abs(median(slip[where, i]) - median(slip[where][:, others])) > options.feigned_slip  # nor nan
@@ -466,7 +450,7 @@ def runs(holds: Mask) -> list[tuple[int, int]]:
 
 
 CHECKS: Sequence[Callable[[ConsistencyInput], Iterator[str]]] = (
-    frozen, standing_wheels, gear_ratio, load_sum, slip_without_traction, wheel_derived_speed,
+    frozen, gear_ratio, load_sum, slip_without_traction, wheel_derived_speed,
     scale_of_acceleration, draft_sign,
 )  # fmt: skip
 """In their order: what one names the next ones do not see."""

@@ -1,18 +1,32 @@
-"""A recording in bins beside its configuration, and the thresholds from which it contradicts it."""
+"""A recording decoded whole, in bins beside its configuration, and the thresholds from which it contradicts it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable
+from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.arrays import Array, Mask
+from soilbus.arrays import Array
+from soilbus.can.admission import Admission
+from soilbus.can.candump import Frame
+from soilbus.can.channels import Column, Reason
 from soilbus.config.model import Config
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.instrumentation import completed
+from soilbus.estimation.window import forward, turning
+from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import change, without
 from soilbus.terra.vehicle import slip_ratio
+
+Columns = dict[str, tuple[Array, Array]]
+"""Times [s] and values (SI) by channel name."""
+
+BATCH_SIZE = 5000
+"""Number of frames that are decoded at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +101,42 @@ class UndecidableError(Exception):
     """Error of a recording that cannot decide a check; the text says which and why."""
 
 
-class Facts(NamedTuple):
+def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns, Counter[tuple[str, Reason]], int]:
+    """Return the samples of the longest part with one clock, and refused values and number of frames of all parts.
+
+    admission: of the channels wanted, it is fed and emptied; frames: of one recording.
+    """
+    parts: list[dict[str, list[Column]]] = [{}]
+    refused: Counter[tuple[str, Reason]] = Counter()
+    n = 0
+
+    def take() -> None:
+        decoded = admission.take()
+        refused.update({key: len(t) for key, t in decoded.refused.items()})
+        for name, column in decoded.columns.items():
+            if len(column.t):
+                parts[-1].setdefault(name, []).append(column)
+
+    def begin_part() -> None:
+        take()
+        parts.append({})
+
+    admission.at_break = begin_part
+    for n, (t, identifier, extended, data, remote, error) in enumerate(frames, 1):
+        if not error:
+            admission.feed(t, identifier, extended, data, remote)
+        if n % BATCH_SIZE == 0:
+            take()
+    take()
+    longest = max(parts, key=lambda part: sum(len(c.t) for columns in part.values() for c in columns))
+    joined = {
+        name: (np.concatenate([c.t for c in columns]), np.concatenate([c.value for c in columns]))
+        for name, columns in longest.items()
+    }
+    return joined, refused, n
+
+
+class Facts:
     """Recording in N bins, as the checks of `check --log` see it.
 
     raw, window: as measured, and turned forward; straight (N,): where the vehicle drives straight on; motor (N, W):
@@ -95,15 +144,24 @@ class Facts(NamedTuple):
     by_radius: wheels whose speed is measured in m/s.
     """
 
-    config: Config
-    rig: Rig
-    raw: Window
-    window: Window
-    straight: Mask
-    motor: Array
-    shaft: Mapping[str, Array]
-    mapped: frozenset[str]
-    by_radius: frozenset[str]
+    def __init__(self, config: Config, mapped: Iterable[str], heard: Columns, by_radius: Collection[str]) -> None:
+        self.config, self.rig, self.mapped, self.by_radius = config, rig_of(config), {*mapped}, {*by_radius}
+        settings, known = config.estimator, {n: heard[n] for n in self.rig.channels if n in heard}
+        start = min((float(t[0]) for t, _ in known.values()), default=0.0)
+        end = max((float(t[-1]) for t, _ in known.values()), default=0.0)
+        store = Bins(self.rig, settings.bin, start)
+        store.add(known)
+        self.raw = store.window(start, end)
+        self.window = completed(forward(self.raw), self.rig)
+        self.straight = np.abs(self.window.ground_speed) > settings.min_speed
+        self.straight &= ~turning(self.window, self.rig, settings.max_turn)
+
+        def binned(name: str) -> Array:
+            t, value = heard.get(name, (np.empty(0), np.empty(0)))
+            return bin_means(t, value, start, settings.bin, len(self.raw.t))
+
+        self.motor = np.stack([binned(f"motor_speed.{wheel}") for wheel in self.rig.wheels], axis=1)
+        self.shaft = {a.name: binned(f"speed.{a.name}") for a in config.axle if f"speed.{a.name}" in heard}
 
     @property
     def slip(self) -> Array:
@@ -122,10 +180,10 @@ class Facts(NamedTuple):
 
     def less(self, channels: Iterable[str]) -> Facts:
         """Return the recording without these channels."""
-        gone = set(channels)
-        motor = np.where([f"motor_speed.{w}" in gone for w in self.rig.wheels], np.nan, self.motor)
-        raw, window = (without(of, self.rig, gone) for of in (self.raw, self.window))
-        return self._replace(raw=raw, window=window, motor=motor)
+        gone, other = set(channels), copy(self)
+        other.motor = np.where([f"motor_speed.{w}" in gone for w in self.rig.wheels], np.nan, self.motor)
+        other.raw, other.window = (without(of, self.rig, gone) for of in (self.raw, self.window))
+        return other
 
 
 def regression(y: Array, x: Array) -> tuple[Array, Array]:

@@ -44,14 +44,6 @@ class Samples(NamedTuple):
         """Return the samples of a mask (N,) or of indices."""
         return Samples(self.column[which], self.t[which], self.value[which], self.settled[which])
 
-    def in_order(self) -> Samples:
-        """Return the samples channel after channel, each in the order of time."""
-        ordered = self.pick(np.argsort(self.column, kind="stable"))
-        same = ordered.column[1:] == ordered.column[:-1]
-        if (same & ~(ordered.t[1:] > ordered.t[:-1])).any():
-            ordered = self.pick(np.lexsort((self.value, self.t, self.column)))
-        return ordered
-
 
 def outlier_test(
     samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION
@@ -61,7 +53,7 @@ def outlier_test(
     A channel with fewer than nine samples is not judged; the first and last four of the
     others are judged by the line nearest to them.
     """
-    samples = samples.in_order()
+    samples = samples.pick(np.lexsort((samples.value, samples.t, samples.column)))
     column, t, value, _ = samples
     n = len(t)
     count = np.bincount(column)
@@ -122,8 +114,7 @@ def _vibration(
 
 def joined(parts: Sequence[Samples]) -> Samples:
     """Return all samples of the parts."""
-    columns, t, value, settled = zip(*(parts or (NO_SAMPLES,)), strict=True)
-    return Samples(np.concatenate(columns), np.concatenate(t), np.concatenate(value), np.concatenate(settled))
+    return Samples(*map(np.concatenate, zip(*(parts or (NO_SAMPLES,)), strict=True)))
 
 
 NO_SAMPLES = Samples(np.zeros(0, np.int16), np.zeros(0), np.zeros(0), np.zeros(0, bool))

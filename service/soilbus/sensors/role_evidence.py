@@ -27,8 +27,7 @@ from soilbus.can.role_matching import ASSERTED, WHEELS, Assignment, Candidate, S
 from soilbus.can.units import STANDARD_GRAVITY
 from soilbus.sensors.bins import bin_means
 from soilbus.sensors.consistency import median
-from soilbus.sensors.facts import LIMITS, regression
-from soilbus.sensors.recorded import Columns, longest_part
+from soilbus.sensors.facts import LIMITS, longest_part, regression
 
 BIN = 0.2
 """Time [s] over which samples are averaged before they are compared: a few frames of each sensor."""
@@ -51,14 +50,24 @@ NO_FRAME, NEVER_AVAILABLE = "no frame of it in the log", "never available"
 """Notes on a candidate without a value."""
 
 
-@dataclass(frozen=True, slots=True)
 class Recording:
     """Samples (SI, no gear) and refused values of candidate signals by `Message.Signal`; its begin and length [s]."""
 
-    columns: Columns
-    refused: Counter[str]
-    start: float
-    seconds: float
+    def __init__(self, found: Iterable[Candidate], database: Database, frames: Iterable[Frame]) -> None:
+        channels: dict[str, Channel] = {}
+        owner: dict[tuple[int, bool], str] = {}
+        for c in found:
+            message = database.get_message_by_name(c.message)
+            if owner.setdefault((message.frame_id, message.is_extended_frame), c.message) == c.message:
+                with suppress(ValueError):
+                    check_decodable(message, c.signal)
+                    channels[c.path] = Channel(c.path, "", c.message, c.signal, c.factor, 0.0, -math.inf, math.inf)
+        self.columns, by_reason, _ = longest_part(Admission(channels.values(), database), frames)
+        self.refused = Counter[str]()
+        for (path, reason), n in by_reason.items():
+            self.refused[path] += n * (reason != Reason.BAD_TIME)
+        self.start = min((float(t[0]) for t, _ in self.columns.values()), default=0.0)
+        self.seconds = max((float(t[-1]) for t, _ in self.columns.values()), default=0.0) - self.start
 
     def mean(self, path: str) -> Array:
         """Return the means over bins from the begin to the end; nan where there is no sample."""
@@ -82,25 +91,6 @@ class Facts:
     kind: str = ""
     mass: float = math.nan
     axle: str = ""
-
-
-def recording_of(found: Iterable[Candidate], database: Database, frames: Iterable[Frame]) -> Recording:
-    """Return the samples of all candidates' signals in one recording."""
-    channels: dict[str, Channel] = {}
-    owner: dict[tuple[int, bool], str] = {}
-    for c in found:
-        message = database.get_message_by_name(c.message)
-        if owner.setdefault((message.frame_id, message.is_extended_frame), c.message) == c.message:
-            with suppress(ValueError):
-                check_decodable(message, c.signal)
-                channels[c.path] = Channel(c.path, "", c.message, c.signal, c.factor, 0.0, -math.inf, math.inf)
-    columns, by_reason, _ = longest_part(Admission(channels.values(), database), frames)
-    refused = Counter[str]()
-    for (path, reason), n in by_reason.items():
-        refused[path] += n * (reason != Reason.BAD_TIME)
-    start = min((float(t[0]) for t, _ in columns.values()), default=0.0)
-    end = max((float(t[-1]) for t, _ in columns.values()), default=0.0)
-    return Recording(columns, refused, start, end - start)
 
 
 def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]:

@@ -10,7 +10,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,15 +25,10 @@ from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_o
 from soilbus.can.units import unit_of
 from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal, Wheel
 from soilbus.estimation.assembly import rig_of
-from soilbus.estimation.instrumentation import completed
-from soilbus.estimation.window import forward, turning
 from soilbus.grouping import grouped
-from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import implausible, resolution_of, runs
-from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, fault
-from soilbus.sensors.motion_checks import MOTION_CHECKS
-from soilbus.sensors.recorded import Columns, longest_part
-from soilbus.sensors.vehicle_checks import VEHICLE_CHECKS
+from soilbus.sensors.facts import LIMITS, Columns, Facts, Finding, UndecidableError, fault, longest_part
+from soilbus.sensors.vehicle_checks import CHECKS
 
 MAX_LISTED = 4
 """Identifiers that one line names."""
@@ -43,32 +37,21 @@ NOTHING: tuple[Array, Array] = np.empty(0), np.empty(0)
 OTHER_SENDER = "another priority or source address than in the DBC?"
 
 
-@dataclass(frozen=True, slots=True)
 class Seen:
-    """One mapped signal: number of values, rate [1/s], range and median (SI), refused values by reason; nan without."""
+    """One mapped signal: number of values, rate [1/s], range and median (SI), refused values by reason; nan without.
 
-    channel: Channel
-    count: int
-    rate: float
-    low: float
-    high: float
-    median: float
-    refused: Mapping[Reason, int]
+    unit: of its values in SI, "" of a code; is_absent: no frame held it; is_optional: estimates do without it.
+    """
 
-    @property
-    def unit(self) -> str:
-        """SI unit of its values; "" of a code."""
-        return si_unit(self.channel)
-
-    @property
-    def is_absent(self) -> bool:
-        """Whether no frame held it."""
-        return self.count == 0 and not self.refused
-
-    @property
-    def is_optional(self) -> bool:
-        """Whether estimates do without it."""
-        return self.channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
+    def __init__(self, channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> None:
+        t, value = heard.get(channel.name, NOTHING)
+        self.channel, self.unit, self.count = channel, si_unit(channel), len(t)
+        self.rate = float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 and t[-1] > t[0] else math.nan
+        ends = np.quantile(value, [0.0, 0.5, 1.0]).tolist() if len(value) else [math.nan] * 3
+        self.low, self.median, self.high = map(float, ends)
+        self.refused = {reason: n for (name, reason), n in refused.items() if name == channel.name}
+        self.is_absent = self.count == 0 and not self.refused
+        self.is_optional = channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
 
 
 class Survey(NamedTuple):
@@ -102,7 +85,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
         config = with_motors
     admission = Admission(channels, database, checked_messages(config, database))
     heard, refused, n = longest_part(admission, frames)
-    seen = tuple(_seen(c, heard, refused) for c in channels if c.name in mapped)
+    seen = tuple(Seen(c, heard, refused) for c in channels if c.name in mapped)
     findings = list(_absent(seen, database, admission.counts))
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
@@ -113,9 +96,11 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
     findings += _too_slow_to_measure(heard, config)
     findings += _mixed_rates(seen, config)
     questions = [f"{s.channel.key}: not in this recording" for s in seen if s.is_absent and s.is_optional]
-    facts = _facts(config, mapped, heard, database)
-    if facts is not None:
-        questions += _compare(facts, findings, channels, database)
+    rig = rig_of(config)
+    if rig.wheels and heard.keys() & {*rig.channels}:
+        speeds = {w.name: found_signal(database, w.speed.signal)[1].unit for w in config.wheel if w.speed is not None}
+        by_radius = [wheel for wheel, unit in speeds.items() if _dimension(unit) == "speed"]
+        questions += _compare(Facts(config, mapped, heard, by_radius), findings, channels, database)
     return Survey(seen, tuple(findings), tuple(questions))
 
 
@@ -143,39 +128,6 @@ def _dimension(unit: str | None) -> str:
     with suppress(ValueError):
         return known.dimension if (known := unit_of(unit)) is not None else ""
     return ""
-
-
-def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
-    t, value = heard.get(channel.name, NOTHING)
-    rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 and t[-1] > t[0] else math.nan
-    low, middle, high = np.quantile(value, [0.0, 0.5, 1.0]).tolist() if len(value) else [math.nan] * 3
-    why = {reason: n for (name, reason), n in refused.items() if name == channel.name}
-    return Seen(channel, len(t), float(rate), low, high, middle, why)
-
-
-def _facts(config: Config, mapped: Iterable[str], heard: Columns, database: Database) -> Facts | None:
-    """The recording in bins; None where no wheel is measured or nothing was heard of the rig."""
-    rig, settings = rig_of(config), config.estimator
-    known = {name: column for name, column in heard.items() if name in set(rig.channels)}
-    if not rig.wheels or not known:
-        return None
-    start, end = min(float(t[0]) for t, _ in known.values()), max(float(t[-1]) for t, _ in known.values())
-    store = Bins(rig, settings.bin, start)
-    store.add(known)
-    raw = store.window(start, end)
-    if not len(raw.t):
-        return None
-    window, n = completed(forward(raw), rig), len(raw.t)
-
-    def binned(name: str) -> Array:
-        return bin_means(*heard.get(name, NOTHING), start, settings.bin, n)
-
-    motor = np.stack([binned(f"motor_speed.{wheel}") for wheel in rig.wheels], axis=1)
-    shaft = {a.name: binned(f"speed.{a.name}") for a in config.axle if f"speed.{a.name}" in heard}
-    straight = (np.abs(window.ground_speed) > settings.min_speed) & ~turning(window, rig, settings.max_turn)
-    speeds = {w.name: found_signal(database, w.speed.signal)[1].unit for w in config.wheel if w.speed is not None}
-    by_radius = frozenset(wheel for wheel, unit in speeds.items() if _dimension(unit) == "speed")
-    return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped), by_radius)
 
 
 # --- one signal by itself ---
@@ -330,7 +282,7 @@ def _compare(facts: Facts, findings: list[Finding], channels: Iterable[Channel],
         least = f"{LIMITS.least_seconds:g} s: signs, gear ratio and sides cannot be compared"
         return [f"the vehicle drives straight on for less than {least}"]
     questions: list[str] = []
-    for check in (*VEHICLE_CHECKS, *MOTION_CHECKS):
+    for check in CHECKS:
         found: list[Finding] = []
         try:
             found += check(facts)
