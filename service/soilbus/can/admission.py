@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,7 +17,7 @@ from cantools.database.can import Database, Message
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
-from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox, popped
+from soilbus.can.inbox import CHECKS, Batch, Data, Frame, Inbox
 from soilbus.can.j1939 import STANDARD_PGNS, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 from soilbus.grouping import grouped
@@ -27,10 +27,19 @@ CLOCK_STEP = 1.0  # the same, above which the clock was set and the new time is 
 LONGEST_GAP = 60.0  # seconds without a mapped frame after which a new recording begins: the bus slept, a clock was set
 LAST_TIME = 1e10  # stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move
 MAX_LISTED_UNKNOWN = 1024
+WRONG_CHECKSUMS = 0.05  # share of a message's frames from which wrong checksums are said; a good bus has none
+SPAN = 10.0  # time [s] over which a service counts them: a default window
 
 _EXTENDED = 1 << 31
 _FOLLOWS = LONGEST_GAP + OUT_OF_ORDER
 _NONE: Array = np.empty(0)
+
+MEANING = {
+    Reason.BAD_CHECKSUM: "wrong Checksum: a second sender or a bad connection; where nearly all are wrong, another"
+    " maker's checksum (dbc.checked, dbc/README.md)",
+    Reason.SECOND_SENDER: "the Counter does not go on by one: a second sender, or most frames are lost",
+}
+"""Why a message cannot be trusted, in words of a vehicle engineer."""
 
 
 @dataclass(slots=True)
@@ -55,6 +64,34 @@ class Counts:
         """Return the unknown identifiers of the same parameter group as a 29-bit one, smallest first."""
         unknown = (key & ~_EXTENDED for key in self.unknown_ids if key & _EXTENDED)
         return sorted(identifier for identifier in unknown if pgn_of(identifier) == pgn_of(arbitration_id))
+
+
+def doubts(received: Counter[str], refused: Counter[tuple[str, Reason]]) -> dict[str, str]:
+    """Return a line for each message with a second sender or with many wrong checksums, by message and reason."""
+    lines = {}
+    for (name, reason), n in sorted(refused.items()):
+        share = n / max(received[name], n)
+        if n and (reason is Reason.SECOND_SENDER or (reason is Reason.BAD_CHECKSUM and share >= WRONG_CHECKSUMS)):
+            said = f"{share:.0%} of {received[name]} frames of {name} are refused"
+            lines[f"{name} {reason}"] = f"{said}: {MEANING[reason]}"
+    return lines
+
+
+class RecentDoubts:
+    """The doubts of the last SPAN seconds of counts that go on."""
+
+    def __init__(self, counts: Counts) -> None:
+        self._counts = counts
+        self._before: deque[tuple[float, Counter[str], Counter[tuple[str, Reason]]]] = deque()
+
+    def at(self, now: float) -> dict[str, str]:
+        """Return the lines of `doubts` at `now` [s], which does not go back; call it about once a second."""
+        received, refused = self._counts.received.copy(), self._counts.refused.copy()
+        self._before.append((now, received, refused))
+        while self._before[0][0] < now - SPAN:
+            self._before.popleft()
+        _, received_before, refused_before = self._before[0]
+        return doubts(received - received_before, refused - refused_before)
 
 
 class Admission:
@@ -94,9 +131,15 @@ class Admission:
     def feed(self, t: float, arbitration_id: int, extended: bool, data: Data, remote: bool = False) -> None:
         """File one data or remote frame received at t [s]; `data` is kept, not copied."""
         key = arbitration_id | _EXTENDED if extended else arbitration_id
-        inbox = self._by_key.get(key) or self._inbox_of_group(arbitration_id, extended)
+        inbox = self._by_key.get(key)
         if inbox is None:
-            return
+            inbox = self._groups.get(pgn_of(arbitration_id)) if extended else None
+            if inbox is None:
+                self.counts.unknown += 1
+                if key in self.counts.unknown_ids or len(self.counts.unknown_ids) < MAX_LISTED_UNKNOWN:
+                    self.counts.unknown_ids[key] += 1
+                return
+            self._by_key[key] = inbox
         if not 0.0 <= t - self._earliest <= _FOLLOWS and not self._is_time(inbox, t):
             return
         if t - OUT_OF_ORDER > self._earliest:
@@ -115,7 +158,8 @@ class Admission:
         out = Decoded(untimed=self._untimed)
         self._untimed = Counter()
         for inbox in self._inboxes:
-            self._open(inbox, popped(inbox, until), out)
+            frames, inbox.frames = inbox.frames, [f for f in inbox.frames if f[0] >= until and until < math.inf]
+            self._open(inbox, [f for f in frames if not f[0] >= until] if inbox.frames else frames, out)
         return out
 
     @property
@@ -145,18 +189,6 @@ class Admission:
             mask = whole if inbox.lock is None else group_mask(number)
             filters.append({"can_id": number & mask, "can_mask": mask, "extended": extended})
         return filters
-
-    def _inbox_of_group(self, arbitration_id: int, extended: bool) -> Inbox | None:
-        """Where a frame goes whose identifier is not in the DBC: to its group, or nowhere."""
-        key = _key(arbitration_id, extended)
-        inbox = self._groups.get(pgn_of(arbitration_id)) if extended else None
-        if inbox is not None:
-            self._by_key[key] = inbox
-            return inbox
-        self.counts.unknown += 1
-        if key in self.counts.unknown_ids or len(self.counts.unknown_ids) < MAX_LISTED_UNKNOWN:
-            self.counts.unknown_ids[key] += 1
-        return None
 
     def _is_time(self, inbox: Inbox, t: float) -> bool:
         """Whether a stamp that does not follow the last ones is of a clock that was set; else its frame is refused."""

@@ -53,7 +53,15 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
     """Return the bus of the section [bus], with kernel filters where it has a kernel; BusError with one line."""
     try:
         bus = can.Bus(**settings, can_filters=filters)
-        _prepare(bus)
+        if is_multicast(bus):
+            with socket.socket(fileno=os.dup(bus.fileno())) as same:
+                ask_for_buffer(same)
+        own = getattr(bus, "socket", None)
+        if isinstance(own, socket.socket):
+            ask_for_buffer(own)
+            if number := own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):  # it is down; it binds all the same
+                bus.shutdown()
+                raise OSError(number, os.strerror(number))
         return bus
     except Exception as error:  # drivers raise all kinds
         raise bus_fault(settings, error) from None
@@ -83,20 +91,6 @@ def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[candump.F
         raise bus_fault(settings, error) from None
 
 
-def _prepare(bus: can.BusABC) -> None:
-    """Raise OSError for an interface that is down: the kernel binds to it all the same."""
-    if is_multicast(bus):
-        with socket.socket(fileno=os.dup(bus.fileno())) as same:
-            ask_for_buffer(same)
-    own = getattr(bus, "socket", None)
-    if not isinstance(own, socket.socket):
-        return
-    ask_for_buffer(own)
-    if number := own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-        bus.shutdown()
-        raise OSError(number, os.strerror(number))
-
-
 def ask_for_buffer(own: socket.socket) -> None:
     """Ask for RECEIVE_BUFFER (socket(7)): an administrator gets all of it, others what net.core.rmem_max allows."""
     own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
@@ -116,15 +110,11 @@ class BusState(StrEnum):
 
 def state_told(before: BusState, error_class: int, data: bytes | bytearray) -> BusState:
     """Return the state after an error frame with this identifier and data; `before` if it tells none."""
-    if error_class & _BUS_OFF:
-        return BusState.OFF
-    if error_class & _RESTARTED:
-        return BusState.ACTIVE
     status = data[1] if error_class & _CONTROLLER and len(data) > 1 else 0
-    for bits, state in ((_PASSIVE, BusState.PASSIVE), (_WARNING, BusState.WARNING), (_ACTIVE, BusState.ACTIVE)):
-        if status & bits:
-            return state
-    return before
+    of_bus = ((error_class & _BUS_OFF, BusState.OFF), (error_class & _RESTARTED, BusState.ACTIVE))
+    of_controller = ((_PASSIVE, BusState.PASSIVE), (_WARNING, BusState.WARNING), (_ACTIVE, BusState.ACTIVE))
+    told = (*of_bus, *((status & bits, state) for bits, state in of_controller))
+    return next((state for is_told, state in told if is_told), before)
 
 
 def tells_overflow(error_class: int, data: bytes | bytearray) -> bool:

@@ -42,14 +42,8 @@ _ERROR_ID = "20000080"  # of an error frame that python-can takes for one; of ca
 
 def frame_of(message: can.Message) -> Frame:
     """Return the frame of a message of python-can; TypeError or ValueError where time or identifier is no number."""
-    return (
-        float(message.timestamp),
-        index(message.arbitration_id),
-        message.is_extended_id,
-        message.data,
-        message.is_remote_frame,
-        message.is_error_frame,
-    )
+    is_extended, is_remote, is_error = message.is_extended_id, message.is_remote_frame, message.is_error_frame
+    return float(message.timestamp), index(message.arbitration_id), is_extended, message.data, is_remote, is_error
 
 
 def whole(message: can.Message) -> can.Message:

@@ -40,7 +40,13 @@ class ColumnDecoder:
     """
 
     def __init__(self, message: Message, signals: Sequence[str]) -> None:
-        self._placed = [(s, _first_bit(s, message.length)) for s in _with_multiplexers(message, signals)]
+        ordered: dict[str, Signal] = {}  # each once and after the multiplexer that it hangs on
+        for name in signals:
+            chain = [check_decodable(message, name)]
+            while (above := chain[-1].multiplexer_signal) is not None:
+                chain.append(check_decodable(message, above))
+            ordered |= {signal.name: signal for signal in reversed(chain)}
+        self._placed = [(signal, _first_bit(signal, message.length)) for signal in ordered.values()]
 
     def columns(self, payload: Payload) -> dict[str, SignalColumn]:
         """Return the values of the signals, and of those they hang on, by name; payload (N, message length)."""
@@ -80,17 +86,6 @@ def check_decodable(message: Message, name: str) -> Signal:
         raise ValueError(f"{message.name}.{name} is a float of {signal.length} bits")
     _first_bit(signal, message.length)
     return signal
-
-
-def _with_multiplexers(message: Message, names: Sequence[str]) -> list[Signal]:
-    """Signals, each once and after the multiplexer that it hangs on."""
-    ordered: dict[str, Signal] = {}
-    for name in names:
-        chain = [check_decodable(message, name)]
-        while (above := chain[-1].multiplexer_signal) is not None:
-            chain.append(check_decodable(message, above))
-        ordered |= {signal.name: signal for signal in reversed(chain)}
-    return list(ordered.values())
 
 
 def _first_bit(signal: Signal, message_length: int) -> int:

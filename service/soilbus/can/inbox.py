@@ -81,12 +81,6 @@ class Inbox:
             self.lock.release()
 
 
-def popped(inbox: Inbox, until: float) -> list[Frame]:
-    """Take the frames before `until` out of the inbox and return them."""
-    frames, inbox.frames = inbox.frames, [f for f in inbox.frames if f[0] >= until and until < math.inf]
-    return [f for f in frames if not f[0] >= until] if inbox.frames else frames
-
-
 def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
     """Return False where the payload does not give the Checksum; None where none is asked for."""
     if inbox.checksum_byte is None:

@@ -14,6 +14,7 @@ from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
 from soilbus.can.validity import meaning, vouching_codes
 from soilbus.config.model import Axle, Config, ConfigError, Wheel
 from soilbus.config.model import Signal as Mapped
+from soilbus.grouping import grouped
 from soilbus.words import did_you_mean
 
 WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed")
@@ -75,21 +76,27 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
     """Return one channel for each role that the configuration maps, wheels first.
 
     Raises ConfigError with a line for each fault: a signal that is not in the DBC, cannot be decoded, has a unit of
-    another dimension than the role or is mapped twice; a validity signal that cannot work.
+    another dimension than the role or is mapped twice; a validity signal that cannot work.  Several wheels may have one
+    limit or one measurement.
     """
-    roles = list(_roles(config))
-    first = {(role.quantity, role.mapped.signal): role for role in reversed(roles)}
-    channels, faults = [], []
-    for role in roles:
-        is_shared = role.quantity in SHARED_ROLES and isinstance(role.part, Wheel)
-        if is_shared and first[role.quantity, role.mapped.signal] is not role:
+    channels, faults, twice = [], [], []
+    first: dict[str, _Role] = {}
+    for role in _roles(config):
+        known = first.setdefault(role.mapped.signal, role)
+        is_same = known is not role and known.quantity == role.quantity
+        if is_same and role.quantity in SHARED_ROLES and isinstance(role.part, Wheel):
             continue  # the channel of another wheel, too, which came first
+        if known is not role and not (is_same and role.quantity == "torque_limit"):
+            twice.append(f"{role.where}: {role.mapped.signal} is already mapped to {known.where}")
         try:
             channels.append(_channel(config, database, role))
         except _Fault as fault:
             faults.append(f"{role.where}: {fault}")
-    faults += _mapped_twice(roles)
-    faults += _identifiers_shared(channels, database)
+    faults += twice
+    messages = [database.get_message_by_name(name) for name in dict.fromkeys(c.message for c in channels)]
+    for (number, _), (first_one, *others) in grouped(messages, lambda m: (m.frame_id, m.is_extended_frame)).items():
+        same = f"have the same identifier {number:#x}"
+        faults += [f"messages {first_one.name} and {other.name} {same}" for other in others]
     if faults:
         raise ConfigError(faults)
     return channels
@@ -275,23 +282,3 @@ _GREATEST = {
     "yaw_rate": 4.0,  # a skid-steered rover on the spot
     "latitude": math.pi / 2.0, "longitude": math.pi + 1e-9,  # 180 degrees, however it is rounded
 }  # fmt: skip
-
-
-def _mapped_twice(roles: Iterable[_Role]) -> Iterator[str]:
-    """A line for each signal of two roles; limits of several wheels, or one measurement of several, are none."""
-    first: dict[str, _Role] = {}
-    for role in roles:
-        known = first.setdefault(role.mapped.signal, role)
-        of_wheels = isinstance(known.part, Wheel) and isinstance(role.part, Wheel)
-        once = role.quantity == "torque_limit" or (of_wheels and role.quantity in SHARED_ROLES)
-        if known is not role and not (once and known.quantity == role.quantity):
-            yield f"{role.where}: {role.mapped.signal} is already mapped to {known.where}"
-
-
-def _identifiers_shared(channels: Iterable[Channel], database: Database) -> Iterator[str]:
-    owner: dict[tuple[int, bool], str] = {}
-    for name in dict.fromkeys(c.message for c in channels):
-        message = database.get_message_by_name(name)
-        known = owner.setdefault((message.frame_id, message.is_extended_frame), name)
-        if known != name:
-            yield f"messages {known} and {name} have the same identifier {message.frame_id:#x}"

@@ -197,7 +197,10 @@ def axles_of(assignment: Assignment) -> dict[str, tuple[str, str]]:
 
 
 def assigned(found: Iterable[Candidate]) -> Assignment:
-    """Assign each signal to one slot by the largest sum of scores; what is not clear stays open."""
+    """Assign each signal to one slot by the largest sum of scores; what is not clear stays open.
+
+    At last the one candidate of a slot and of no other is asserted, where its place and its torque are known.
+    """
     from scipy.optimize import linear_sum_assignment
 
     best: dict[tuple[Slot, str], Candidate] = {}
@@ -225,12 +228,6 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
             out.rivals.extend(c for c in rivals if c.score >= ASSERTED)
         elif of_slot:
             out.open[slot] = of_slot
-    _take_sole(out)
-    return out
-
-
-def _take_sole(out: Assignment) -> None:
-    """Assert what is the one candidate of its slot and of no other, where its place and its torque are known."""
     uses = Counter(c.path for cs in out.open.values() for c in cs)
     for slot, (first, *others) in list(out.open.items()):
         is_whole = slot.role not in WHEEL_ONLY | WHEEL_AND_AXLE or slot.place
@@ -238,6 +235,7 @@ def _take_sole(out: Assignment) -> None:
         if is_whole and is_known and not others and uses[first.path] == 1 and first.score >= SOLE:
             out.asserted[slot] = first.changed(0.0, ONLY)
             del out.open[slot]
+    return out
 
 
 def described(candidate: Candidate) -> str:

@@ -45,8 +45,8 @@ class CodeRule:
 
     def __init__(self, signal: Signal, is_standard: bool = False) -> None:
         self.is_float = signal.conversion.is_float
-        names = signal.choices or {}
-        self.special = {code: reason for code, name in names.items() if (reason := meaning(str(name)))}
+        meanings = ((code, meaning(str(name))) for code, name in (signal.choices or {}).items())
+        self.special = {code: reason for code, reason in meanings if reason is not None}
         self.bands = None if self.is_float or signal.is_signed else _BANDS.get(signal.length)
         self.low, self.high = _range_of(signal)
         if is_standard and self.bands is not None:
@@ -67,16 +67,15 @@ def meaning(name: str) -> Reason | None:
     return Reason.RESERVED if _RESERVED.search(text) else None
 
 
-def vouches(name: str) -> bool:
-    """Return whether a code of that name in a value table says that another signal is valid."""
-    text = _NO_FAULT.sub("ok", _in_words(name))
-    rest, count = _VOUCHING.subn("", _OF_WHAT.sub("", text))
-    return meaning(name) is None and count > 0 and not rest.strip()
-
-
 def vouching_codes(signal: Signal) -> tuple[int, ...]:
     """Return the raw codes that vouch for another signal by their names in the value table; () without any."""
-    return tuple(sorted(code for code, name in (signal.choices or {}).items() if vouches(str(name))))
+    found = []
+    for code, name in (signal.choices or {}).items():
+        text = _NO_FAULT.sub("ok", _in_words(str(name)))
+        rest, count = _VOUCHING.subn("", _OF_WHAT.sub("", text))
+        if meaning(str(name)) is None and count > 0 and not rest.strip():
+            found.append(code)
+    return tuple(sorted(found))
 
 
 def _in_words(name: str) -> str:

@@ -20,8 +20,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
+from soilbus.can.admission import RecentDoubts
 from soilbus.can.bus import SAY_AGAIN, BusState, LiveBus
-from soilbus.can.doubts import RecentDoubts
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
 from soilbus.daemon.bus_health import health_frame, health_text

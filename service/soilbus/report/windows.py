@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from soilbus.can.doubts import doubts
+from soilbus.can.admission import doubts
 from soilbus.decision.traversability import State, Status
 from soilbus.grouping import grouped
 from soilbus.pipeline.pipeline import Pipeline

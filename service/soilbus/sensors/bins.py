@@ -59,7 +59,15 @@ class Bins:
         if outlier.any():
             self._outliers.append(samples.t[new & outlier & ~again] + self.origin)
         self._recent.append(samples._replace(settled=~again).pick(later < 2 * SIDE))
-        return self._made(low, high)
+        count, total, time = self._totals[:, low:high]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean, since = total / count, time / count
+        centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
+        of_vehicle = slice(len(WHEEL_QUANTITIES) * self._noise.n_wheels, None)
+        n, count = int(count.sum()), count.copy()
+        _bridge(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
+        mean, worth = _at_centres(mean, since, centre)
+        return made_window(self._noise, self.origin + centre, mean, count * worth, n)
 
     def glimpse(self, start: float, end: float) -> Window:
         """Return the same as `window` without changing the state."""
@@ -114,17 +122,6 @@ class Bins:
         place = (bins - low) * width + samples.column
         for total, weights in zip(self._totals, (None, samples.value, samples.t), strict=True):
             total[low:high] += np.bincount(place, weights, (high - low) * width).reshape(-1, width)
-
-    def _made(self, low: int, high: int) -> Window:
-        count, total, time = self._totals[:, low:high]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean, since = total / count, time / count
-        centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
-        of_vehicle = slice(len(WHEEL_QUANTITIES) * self._noise.n_wheels, None)
-        samples, count = int(count.sum()), count.copy()
-        _bridge(mean[:, of_vehicle], since[:, of_vehicle], count[:, of_vehicle], centre)
-        mean, worth = _at_centres(mean, since, centre)
-        return made_window(self._noise, self.origin + centre, mean, count * worth, samples)
 
 
 def bin_means(t: Array, value: Array, start: float, length: float, n: int) -> Array:

@@ -72,7 +72,10 @@ def outlier_test(
     far = np.flatnonzero(off > options.outlier_sd * noise)
     far = far[count[column[far]] >= SPAN]
     if len(far):
-        spread = options.quartile_distances * _spread(t, value, line[far], slope[far])
+        first = line[far, None]
+        nine = first + np.arange(SPAN)
+        level = np.sort(value[nine] - slope[far, None] * (t[nine] - t[first]), axis=1)
+        spread = options.quartile_distances * (level[:, SIDE + 2] - level[:, SIDE - 2])
         scatter = options.outlier_sd * _vibration(value, noise, end - count, end, column[far]) * noise[far]
         outlier[far] = off[far] > np.maximum(spread, scatter)
     return samples, outlier, later
@@ -89,13 +92,6 @@ def _lines(t: Array, value: Array) -> Array:
     rise, run = after - before
     slope = np.divide(rise, run, where=run > 0.0, out=np.zeros(len(run)))  # 0 where the nine are of two channels
     return np.stack([slope, *(before + after) * 0.5])
-
-
-def _spread(t: Array, value: Array, first: NDArray[np.intp], slope: Array) -> Array:
-    """Distance of the quartiles of nine samples, from `first` on, less their slope; each (M,)."""
-    nine = first[:, None] + np.arange(SPAN)
-    level = np.sort(value[nine] - slope[:, None] * (t[nine] - t[first, None]), axis=1)
-    return np.asarray(level[:, SIDE + 2] - level[:, SIDE - 2])
 
 
 def _vibration(

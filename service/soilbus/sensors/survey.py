@@ -16,11 +16,10 @@ import numpy as np
 from cantools.database.can import Database, Message
 
 from soilbus.arrays import Array
-from soilbus.can.admission import Admission, Counts
+from soilbus.can.admission import MEANING, Admission, Counts
 from soilbus.can.candump import Frame
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
-from soilbus.can.doubts import MEANING
 from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of, found_signal, si_unit
 from soilbus.can.units import unit_of
 from soilbus.config.model import SHORT_BIN, Config, ConfigError, Signal, Wheel
