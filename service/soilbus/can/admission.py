@@ -32,7 +32,6 @@ SPAN = 10.0  # time [s] over which a service counts them: a default window
 
 _EXTENDED = 1 << 31
 _FOLLOWS = LONGEST_GAP + OUT_OF_ORDER
-_NONE: Array = np.empty(0)
 
 MEANING = {
     Reason.BAD_CHECKSUM: "wrong Checksum: a second sender or a bad connection; where nearly all are wrong, another"
@@ -120,7 +119,7 @@ class Admission:
             message = database.get_message_by_name(name)
             is_open = hears_any_source(message, database)
             inbox = Inbox(message, members, is_open, name in checked)
-            key = _key(message.frame_id, message.is_extended_frame)
+            key = message.frame_id | _EXTENDED if message.is_extended_frame else message.frame_id
             if key in self._by_key:
                 raise ValueError(f"{name}: another mapped message has the identifier {message.frame_id:#x} too")
             self._by_key[key] = inbox
@@ -175,7 +174,7 @@ class Admission:
 
     def cut_short(self, arbitration_id: int, extended: bool, data: Data) -> Message | None:
         """Return the mapped message of a frame that is shorter than the DBC says, unlike others of it."""
-        inbox = self._by_key.get(_key(arbitration_id, extended))
+        inbox = self._by_key.get(arbitration_id | _EXTENDED if extended else arbitration_id)
         if inbox is None or len(data) >= inbox.message.length or not self.counts.admitted[inbox.message.name]:
             return None
         return inbox.message
@@ -219,8 +218,7 @@ class Admission:
             self._refuse(inbox, np.array(inbox.late), Reason.TIME_BACKWARDS, out)
             inbox.late = []
         if batch is None:
-            for channel in inbox.channels:
-                out.columns[channel.name] = Column(_NONE, _NONE)
+            out.columns |= {channel.name: Column(np.empty(0), np.empty(0)) for channel in inbox.channels}
             return
         self.counts.admitted[inbox.message.name] += len(batch.t)
         columns = batch.columns(inbox.decoder)
@@ -269,10 +267,6 @@ class Admission:
         if n:
             self.counts.refused[inbox.message.name, reason] += n
             self._untimed[reason] += n * len(inbox.channels)
-
-
-def _key(arbitration_id: int, extended: bool) -> int:
-    return arbitration_id | _EXTENDED if extended else arbitration_id
 
 
 def hears_any_source(message: Message, database: Database) -> bool:

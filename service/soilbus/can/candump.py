@@ -22,8 +22,6 @@ Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
 
 Heard = tuple[str, Frame]  # channel of a frame, and the frame
 
-NO_STAMPS = "its lines have no time stamps: record with candump -L, or candump -ta"
-
 # identifiers above 1FFFFFFF carry flags
 _PLAIN_LINE = re.compile(
     r"\(([0-9]+\.[0-9]+)\) (\S+) ([0-9A-Fa-f]{3}|[01][0-9A-Fa-f]{7})#([0-9A-Fa-f]+)(?: [RT])?\n?"
@@ -81,7 +79,7 @@ def _log_line(line: str) -> str:
     """A line of candump as `candump -L` would write it, dates as UTC, error frames as python-can knows them."""
     found = _LOG_LINE.match(line) or _CONSOLE_LINE.match(line)
     if (found is None and _UNSTAMPED.match(line)) or (found is not None and found["time"] is None):
-        raise ValueError(NO_STAMPS)
+        raise ValueError("its lines have no time stamps: record with candump -L, or candump -ta")
     if found is None:
         return line
     is_error = int(found["id"], 16) & _ERROR_FLAG

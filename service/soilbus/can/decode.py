@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 Payload = NDArray[np.uint8]
 
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
-_FLOAT_BITS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
 
 
 class SignalColumn(NamedTuple):
@@ -109,5 +108,5 @@ def _codes(payload: Payload, signal: Signal, first: int) -> NDArray[Any]:
     words[:, slice(64 - length, 64) if order == "big" else slice(length)] = bits
     codes = np.packbits(words, axis=1, bitorder=order).view(">u8" if order == "big" else "<u8")[:, 0].astype(np.uint64)
     if is_float:
-        return codes.astype(_FLOAT_BITS[length]).view(_FLOATS[length]).astype(np.float64)
+        return codes.astype(np.dtype(f"u{length // 8}")).view(_FLOATS[length]).astype(np.float64)
     return codes if length == 64 and not signal.is_signed else codes.view(np.int64)

@@ -68,11 +68,9 @@ class SourceLock:
         """Return whether a frame of `source` at t [s] counts; move the lock where it must."""
         if source != self.source and source != self.own and t - self.heard <= self.patience:
             return False
-        self.source = source
-        self.heard = max(self.heard, t)
+        self.source, self.heard = source, max(self.heard, t)
         return True
 
     def release(self) -> None:
         """Forget the source and its time."""
-        self.source = None
-        self.heard = -math.inf
+        self.source, self.heard = None, -math.inf

@@ -37,7 +37,6 @@ WRAP = 2**32 / 1e6  # seconds after which the stamps of an analyser of 32 bits b
 OF_SIGNALS = "if it holds decoded signals, soilbus init --table maps them"
 TOO_LARGE = f"a block of more than {LIMITS.block >> 20} MiB"
 DAY = 86400.0  # seconds after which a clock of hours, minutes and seconds begins again
-RELATIVE = "its stamps are relative to the event before: save it with absolute ones"
 
 
 class Format(NamedTuple):
@@ -99,7 +98,7 @@ def _asc(stream: BufferedReader) -> Iterator[Heard]:
     last = float("-inf")
     for message in reader:
         if message.timestamp < last and reader.timestamps_format == "relative":
-            raise ValueError(RELATIVE)
+            raise ValueError("its stamps are relative to the event before: save it with absolute ones")
         last = message.timestamp
         yield of_message(message, 1)
 
@@ -117,16 +116,20 @@ class _Clock:
         return t + self._late
 
 
+_Said = tuple[float, bool, bytes, int, bool]
+"""What a row of a CSV says: time [s], extended, data, length, remote."""
+
+
 def _truth(text: str) -> bool:
     return text.lower() in ("1", "true")
 
 
-def _gvret(row: Mapping[str, str]) -> tuple[float, bool, bytes, int, bool]:
+def _gvret(row: Mapping[str, str]) -> _Said:
     data = bytes(int(cell, 16) for i in range(1, 65) if (cell := row.get(f"d{i}", "")))
     return int(row["time stamp"]) / 1e6, _truth(row["extended"]), data, int(row["len"]), False
 
 
-def _canedge(row: Mapping[str, str]) -> tuple[float, bool, bytes, int, bool]:
+def _canedge(row: Mapping[str, str]) -> _Said:
     data = bytes.fromhex(row["databytes"])
     length = int(row.get("datalength", len(data)))
     return float(row["timestampepoch"]), _truth(row["ide"]), data, length, _truth(row.get("rtr", "0"))
@@ -136,7 +139,7 @@ _CSVS = (
     ("SavvyCAN (GVRET) CSV", {"time stamp", "id", "extended", "len", "d1"}, _gvret),
     ("CANedge CSV", {"timestampepoch", "id", "ide", "databytes"}, _canedge),
 )
-"""Name, columns by which it is recognised, and what a row says: time [s], extended, data, length, remote."""
+"""Name, columns by which it is recognised, and what a row says."""
 _OF_PYTHON_CAN = ["timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"]
 
 
@@ -155,9 +158,7 @@ def _cells(line: str) -> list[str]:
     return [cell.strip() for cell in line.replace(";", ",").split(",")]
 
 
-def _of_csv(
-    said: Callable[[Mapping[str, str]], tuple[float, bool, bytes, int, bool]], stream: BufferedReader
-) -> Iterator[Heard]:
+def _of_csv(said: Callable[[Mapping[str, str]], _Said], stream: BufferedReader) -> Iterator[Heard]:
     rows = (line for line in text_lines(stream) if line.strip())
     names = _cells(next(rows).lower())
     unwrapped = _Clock(WRAP if said is _gvret else math.inf)

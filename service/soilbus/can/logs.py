@@ -28,10 +28,10 @@ class LogError(WorkError):
     """Error of a log that cannot be read to its end."""
 
     windows = 0  # that ended before the damage
-    lasting = True  # False where the fault is of the machine that reads it, not of what is in the log
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, lasting: bool = True) -> None:
         super().__init__(shown(text))
+        self.lasting = lasting  # False where the fault is of the machine that reads it, not of what is in the log
 
 
 class OtherBus(LogError):
@@ -47,16 +47,12 @@ class Log:
 
     def __init__(self, path: Path, channel: str = "", demanded: bool = False) -> None:
         self.path, self.wanted, self._demanded = path, channel, demanded
+        self.name = "standard input" if str(path) == "-" else str(path)  # in messages
         self.kind = ""  # its format, such as "candump log, gzip", from the first frame on
         self.chosen = ""  # the channel whose frames are handed out
         self.channels: Counter[str] = Counter()  # frames by channel, as far as it was read
         self.span = 0.0  # time from the first frame to the latest one read [s]
         self._given = 0
-
-    @property
-    def name(self) -> str:
-        """Name of the log in messages."""
-        return "standard input" if str(self.path) == "-" else str(self.path)
 
     @property
     def left_out(self) -> int:
@@ -97,9 +93,7 @@ class Log:
         if is_of_file_system or isinstance(error, (MemoryError, ModuleNotFoundError)):
             is_full = isinstance(error, MemoryError)
             why = "not enough memory to read it" if is_full else getattr(error, "strerror", None) or str(error)
-            fault = LogError(f"{self.name}: {why}")
-            fault.lasting = False
-            return fault
+            return LogError(f"{self.name}: {why}", lasting=False)
         what = f"cut off or damaged after {self._given} frames" if self._given else "not a CAN log that can be read"
         why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 150)
         return LogError(f"{self.name}: {what} ({why})")

@@ -40,7 +40,6 @@ DIMENSIONS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Dimensions that the unit of a role's signal may have, that of its values in SI first."""
 _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
-_HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
 
 
 class _Number(NamedTuple):
@@ -202,7 +201,7 @@ def _validity(message: Message, mapped: Mapped) -> tuple[str | None, tuple[int, 
 def _factor(role: _Role, signal: Signal) -> float:
     """SI value of one unit of the DBC, on the wheel's side of the gear."""
     quantity, part, mapped, where = role
-    if mapped.at is not None and quantity not in _HAS_SIDE:
+    if mapped.at is not None and quantity not in _SHAFT_BY_DEFAULT | {"speed"}:
         raise _Fault(f"at = {mapped.at} has no meaning for {quantity}")
     dimension, factor = _unit(quantity, signal, mapped)
     of_motor = quantity in _SHAFT_BY_DEFAULT or where.endswith("motor_speed")

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from cantools.database import Database
@@ -23,8 +22,7 @@ NOT_AVAILABLE, ERROR = "not_available", "error"
 _BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """Frame that is ready to send."""
 
     arbitration_id: int

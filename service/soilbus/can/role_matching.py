@@ -73,18 +73,14 @@ _OTHER = (
     " temperature voltage counter checksum percent rated loss friction north east up down link lift position"
 )
 _WORDS: dict[str, frozenset[str]] = {}
-for _word, _short in _SPELLINGS.items():
+for _word, _short in (dict.fromkeys(_OTHER.split(), "") | {**_SPELLINGS}).items():
     for _spelling in (_word, *_short.split()):
         _WORDS[_spelling] = _WORDS.get(_spelling, frozenset()) | {_word}
-for _spelling in _OTHER.split():
-    _WORDS.setdefault(_spelling, frozenset({_spelling}))
 
 _CORNERS = {"fl": "FL", "lf": "FL", "fr": "FR", "rf": "FR", "rl": "RL", "lr": "RL", "rr": "RR"} | {
     "vl": "FL", "vr": "FR", "hl": "RL", "hr": "RR", "ml": "ML", "mr": "MR"
 }  # fmt: skip
-_NUMBERED = {
-    a: f"{k}{side}" for k in range(1, 5) for side in "LR" for a in (f"{k}{side}".casefold(), f"{side}{k}".casefold())
-}
+_NUMBERED = {pair: k + side.upper() for k in "1234" for side in "lr" for pair in (k + side, side + k)}
 _AXLE_LETTERS = {"f": ("r", "front"), "r": ("f", "rear"), "v": ("h", "front"), "h": ("v", "rear")}
 """Letter of an axle: its counterpart, and the axle."""
 _GROUPS: Mapping[int, frozenset[str]] = {

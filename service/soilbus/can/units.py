@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 
 
-@dataclass(frozen=True, slots=True)
-class Unit:
+class Unit(NamedTuple):
     """Unit with its factor: `value in SI = factor * value`; none of our quantities has an offset."""
 
     dimension: str
