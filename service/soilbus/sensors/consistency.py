@@ -285,7 +285,11 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
         yield "ground_speed"
         return
     yield from (f"speed.{rig.wheels[i]}" for i in stood)
-    if len(idles) == len(wheels) and not _pulls(data, np.asarray(idle.all(axis=1))):
+    chassis, asked, least = rig.chassis, window.draft, 0.0
+    if chassis is not None:
+        asked = pull_given(window, chassis)
+        least = options.driving_traction / 3.0 * chassis.mass * GRAVITY
+    if len(idles) == len(wheels) and not median(asked[np.asarray(idle.all(axis=1))]) > least:
         yield "ground_speed"  # or the torques: coasting at a ground speed that is reported too low looks the same
     yield from (f"torque.{rig.wheels[i]}" for i in idles)
     drags = [i for i in drags if i not in stood]
@@ -311,15 +315,6 @@ def wheel_derived_speed(data: ConsistencyInput) -> Iterator[str]:
         if r < 0.0 or r**2 * (len(slip) - 2) < options.significant_sd**2 * (1.0 - r**2):  # does not follow it
             yield "ground_speed"
             return
-
-
-def _pulls(data: ConsistencyInput, where: Mask) -> bool:
-    """Whether draft, slope and inertia ask the wheels to pull at these instants."""
-    chassis = data.rig.chassis
-    if chassis is None:
-        return median(data.window.draft[where]) > 0.0
-    least = data.options.driving_traction / 3.0 * chassis.mass * GRAVITY
-    return median(pull_given(data.window, chassis)[where]) > least
 
 
 def scale_of_acceleration(data: ConsistencyInput) -> Iterator[str]:

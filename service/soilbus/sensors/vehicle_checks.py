@@ -188,6 +188,7 @@ def _gears(facts: Facts) -> Iterator[Finding]:
 
     The speed of an axle's motor against the mean of its wheels, which any differential keeps.
     """
+    ratios: list[tuple[str, Wheel | Axle, float, list[str], str]] = []
     for i, wheel in enumerate(facts.rig.wheels):
         own = next(w for w in facts.config.wheel if w.name == wheel)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -196,7 +197,7 @@ def _gears(facts: Facts) -> Iterator[Finding]:
             f"motor_speed.{wheel}" not in facts.mapped and _log_off(own.gear_ratio * ratio) < CONSISTENCY.gear_slack
         )
         if own.motor_speed is not None and not is_own:
-            yield from _of_gear(facts, f"wheel.{wheel}", own, ratio, [wheel], "the wheel")
+            ratios.append((f"wheel.{wheel}", own, ratio, [wheel], "the wheel"))
     for axle in facts.config.axle:
         names = [w.name for w in facts.config.wheel if w.axle == axle.name and w.speed is not None]
         pair = [facts.rig.wheels.index(name) for name in names if name in facts.rig.wheels]
@@ -208,20 +209,17 @@ def _gears(facts: Facts) -> Iterator[Finding]:
             text = f"axle.{axle.name}.motor_speed: turns backward while its wheels turn forward: sign = -1?"
             yield fault(text, f"torque.{axle.name}", f"speed.{axle.name}")
         else:
-            yield from _of_gear(facts, f"axle.{axle.name}", axle, ratio, names, "the mean of its wheels")
-
-
-def _of_gear(facts: Facts, key: str, of: Wheel | Axle, ratio: float, wheels: list[str], what: str) -> Iterator[Finding]:
-    """A gear ratio [1], of a wheel or an axle, that is wrong by this factor."""
-    if not math.isfinite(ratio) or _log_off(ratio) < CONSISTENCY.gear_slack or of.motor_speed is None:
-        return
-    radius = " radius (the wheels' speeds are in m/s)," if facts.by_radius & set(wheels) else ""
-    yield fault(
-        f"{key}.gear_ratio = {of.gear_ratio:g}, but {of.motor_speed.signal} turns {of.gear_ratio * ratio:.4g} times as"
-        f" fast as {what}: gear ratio,{radius} or unit or byte order of one of the speeds?",
-        f"torque.{of.name}",
-        f"{'motor_speed' if isinstance(of, Wheel) else 'speed'}.{of.name}",
-    )
+            ratios.append((f"axle.{axle.name}", axle, ratio, names, "the mean of its wheels"))
+    for key, of, ratio, names, what in ratios:
+        if not math.isfinite(ratio) or _log_off(ratio) < CONSISTENCY.gear_slack or of.motor_speed is None:
+            continue
+        radius = " radius (the wheels' speeds are in m/s)," if facts.by_radius & set(names) else ""
+        yield fault(
+            f"{key}.gear_ratio = {of.gear_ratio:g}, but {of.motor_speed.signal} turns {of.gear_ratio * ratio:.4g} times"
+            f" as fast as {what}: gear ratio,{radius} or unit or byte order of one of the speeds?",
+            f"torque.{of.name}",
+            f"{'motor_speed' if isinstance(of, Wheel) else 'speed'}.{of.name}",
+        )
 
 
 def _locked(facts: Facts) -> Iterator[Finding]:
@@ -400,10 +398,18 @@ def _sides(facts: Facts) -> Iterator[Finding]:
 def _wheel_based(facts: Facts) -> Iterator[Finding]:
     """A ground speed against which an axle does not slip while its thrust changes.
 
-    Means of a second hold no slip that only a late speed makes.
+    Of each axle whose own torque is measured; where there is none, of all driven wheels.  Means of a second hold no
+    slip that only a late speed makes.
     """
-    second = facts.bins(1.0)
-    for axle, own in _driven_axles(facts).items():
+    second, rig = facts.bins(1.0), facts.rig
+    driven = [w for w in facts.config.wheel if w.driven and w.name in rig.wheels]
+    axles = {
+        axle: wheels
+        for axle, wheels in grouped(driven, lambda w: str(w.axle)).items()
+        if f"torque.{axle}" in facts.mapped or {f"torque.{w.name}" for w in wheels} <= facts.mapped
+    }
+    for axle, wheels in (axles or {"driven": driven}).items() if driven else ():
+        own = [rig.wheels.index(w.name) for w in wheels]
         carried = median(facts.window.load[:, own].sum(axis=1))
         rows = np.stack([facts.slip[:, own].mean(axis=1), facts.thrust[:, own].sum(axis=1) / carried], axis=1)
         means = settled(rows, second, facts.bins(2.0 * LIMITS.least_seconds))
@@ -419,17 +425,6 @@ def _wheel_based(facts: Facts) -> Iterator[Finding]:
                 "ground_speed",
             )
             return
-
-
-def _driven_axles(facts: Facts) -> dict[str, list[int]]:
-    """Wheels of each axle whose own torque is measured; where there is none, all driven wheels."""
-    driven = [w for w in facts.config.wheel if w.driven and w.name in facts.rig.wheels]
-    axles = {
-        axle: [w.name for w in wheels]
-        for axle, wheels in grouped(driven, lambda w: str(w.axle)).items()
-        if f"torque.{axle}" in facts.mapped or {f"torque.{w.name}" for w in wheels} <= facts.mapped
-    } or {"driven": [w.name for w in driven]}
-    return {axle: [facts.rig.wheels.index(name) for name in names] for axle, names in axles.items() if names}
 
 
 def _felt(facts: Facts) -> Array | None:
