@@ -135,7 +135,6 @@ def implausible(
 
     resolution: by channel name; motor_speed: [rad/s] (N, W), nan where unknown, named as "motor_speed.FL".
     """
-
     motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
     data = ConsistencyInput(window, motor, rig, settings, resolution, options)
     if not data.driving.any():
@@ -183,12 +182,9 @@ def frozen(data: ConsistencyInput) -> Iterator[str]:
     with np.errstate(invalid="ignore"):
         same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
     same &= data.driving[1:, None]
-    often = np.flatnonzero(same.sum(axis=0) >= data.sustained).tolist()
-    if not often:
-        return
     variance = np.column_stack([window.variance[q] for q in quantities])
     chance = math.erfc(data.options.significant_sd / math.sqrt(2.0))
-    for i in often:
+    for i in np.flatnonzero(same.sum(axis=0) >= data.sustained).tolist():
         name = rig.channels[i]
         noise, resolution = rig.noise[name.partition(".")[0]], data.resolution.get(name, Resolution(0.0, False))
         stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= data.sustained]

@@ -46,10 +46,6 @@ MOVES_WITH = 0.7
 """Score that a ground speed gains which follows the wheels but slips against them."""
 
 
-NO_FRAME, NEVER_AVAILABLE = "no frame of it in the log", "never available"
-"""Notes on a candidate without a value."""
-
-
 class Recording:
     """Samples (SI, no gear) and refused values of candidate signals by `Message.Signal`; its begin and length [s]."""
 
@@ -100,7 +96,7 @@ def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]
     for c in known:
         if c.path not in recording.columns:
             refused = recording.refused[c.path]
-            what = f"{NEVER_AVAILABLE} in {refused} frames" if refused else NO_FRAME
+            what = f"never available in {refused} frames" if refused else "no frame of it in the log"
             out.append(replace(c.changed(-REFUSED if refused else -ABSENT, what), absent=True))
             continue
         t, value = recording.columns[c.path]
