@@ -49,6 +49,7 @@ class Bins:
         value = np.concatenate([v for _, v in samples.values()])
         self._recent.append(Samples(column, since, value, np.zeros(len(value), bool)))
 
+    @np.errstate(invalid="ignore", divide="ignore")  # of bins without samples
     def window(self, start: float, end: float) -> Window:
         """Return the bins from start to end [s], both rounded to whole bins."""
         low, high = self._span(start, end)
@@ -60,8 +61,7 @@ class Bins:
             self._outliers.append(samples.t[new & outlier & ~again] + self.origin)
         self._recent.append(samples._replace(settled=~again).pick(later < 2 * SIDE))
         count, total, time = self._totals[:, low:high]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean, since = total / count, time / count
+        mean, since = total / count, time / count
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
         of_vehicle = slice(len(WHEEL_QUANTITIES) * self._noise.n_wheels, None)
         n, count = int(count.sum()), count.copy()
@@ -163,9 +163,8 @@ def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]
     """
     if len(mean) < 3:
         return mean, np.ones(mean.shape)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        step = (mean[1:] - mean[:-1]) / (since[1:] - since[:-1])
-        slope = np.concatenate([step[:1], (mean[2:] - mean[:-2]) / (since[2:] - since[:-2]), step[-1:]])
+    step = (mean[1:] - mean[:-1]) / (since[1:] - since[:-1])
+    slope = np.concatenate([step[:1], (mean[2:] - mean[:-2]) / (since[2:] - since[:-2]), step[-1:]])
     for aside in (step[:-1], step[1:]):
         slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], aside)
     known = np.isfinite(slope)

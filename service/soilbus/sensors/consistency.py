@@ -70,9 +70,7 @@ class ConsistencyInput:
         self.raw, self.motor_speed, self.rig, self.resolution, self.options = raw, motor_speed, rig, resolution, options
         self.window, self.bin = completed(raw, rig), settings.bin
         self.driving = (self.window.ground_speed > settings.min_speed) & ~turning(self.window, rig, settings.max_turn)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            grip = self.window.torque / (rig.radius * self.window.load)
-        self.traction = np.where(self.window.load > 0.0, grip, np.nan)
+        self.traction = np.where(self.window.load > 0.0, self.window.torque / (rig.radius * self.window.load), np.nan)
         ground = np.where(self.driving, self.window.ground_speed, np.nan)[:, None]
         self.slip: Array = slip_ratio(rig.radius, self.window.speed, ground)
         bins = options.comparison_time / settings.bin
@@ -123,6 +121,7 @@ def resolution_of(channel: Channel, database: Database) -> Resolution:
     return Resolution(step, unsigned or any(end is not None and float(end) == 0.0 for end in ends))
 
 
+@np.errstate(invalid="ignore", divide="ignore")  # of values that are not known
 def implausible(
     window: Window,
     rig: Rig,
@@ -179,8 +178,7 @@ def frozen(data: ConsistencyInput) -> Iterator[str]:
     window, rig, rare = data.raw, data.rig, 1.0 - data.options.usual_share
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
     value = np.column_stack([getattr(window, q) for q in quantities])
-    with np.errstate(invalid="ignore"):
-        same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
+    same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
     same &= data.driving[1:, None]
     variance = np.column_stack([window.variance[q] for q in quantities])
     chance = math.erfc(data.options.significant_sd / math.sqrt(2.0))
@@ -219,10 +217,9 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
     window, rig, motor, options = data.window, data.rig, data.motor_speed, data.options
     if not np.isfinite(motor).any():
         return
-    with np.errstate(invalid="ignore"):
-        slack = options.gear_slack * np.abs(window.speed)
-        slack += options.significant_sd * np.sqrt(2.0 * window.variance["speed"])
-        apart = data.driving[:, None] & (np.abs(motor - window.speed) > slack)
+    slack = options.gear_slack * np.abs(window.speed)
+    slack += options.significant_sd * np.sqrt(2.0 * window.variance["speed"])
+    apart = data.driving[:, None] & (np.abs(motor - window.speed) > slack)
     wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], data.sustained)]
     good = [i for i in range(len(rig.wheels)) if i not in wrong]
     for i in wrong:
@@ -245,8 +242,7 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
     due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
     has = window.load @ np.stack([rig.ahead, 1.0 - rig.ahead], axis=1)
     excess = (has - due) / (chassis.mass * GRAVITY)
-    with np.errstate(invalid="ignore"):
-        wrong = data.driving & (np.abs(excess.sum(axis=1)) > options.load_error)
+    wrong = data.driving & (np.abs(excess.sum(axis=1)) > options.load_error)
     if not lasts(wrong, data.sustained):
         return
     front, rear = np.median(excess[wrong], axis=0)
@@ -269,12 +265,11 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
 def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
     """Yield torques or speeds of wheels that slip without driving, or drive without slipping or turning."""
     window, rig, slip, grip, options = data.window, data.rig, data.slip, data.traction, data.options
-    with np.errstate(invalid="ignore"):
-        idle = (slip > options.feigned_slip) & (grip < options.idle_traction)
-        dragged = (slip < -options.feigned_slip) & (grip > options.driving_traction)
-        still = rig.radius * window.speed < (1.0 - options.usual_share) * window.ground_speed[:, None]
-        stands = data.driving[:, None] & still & ~(grip < -options.driving_traction)  # nor braked
-        rolls = still & (np.abs(grip) < options.idle_traction)
+    idle = (slip > options.feigned_slip) & (grip < options.idle_traction)
+    dragged = (slip < -options.feigned_slip) & (grip > options.driving_traction)
+    still = rig.radius * window.speed < (1.0 - options.usual_share) * window.ground_speed[:, None]
+    stands = data.driving[:, None] & still & ~(grip < -options.driving_traction)  # nor braked
+    rolls = still & (np.abs(grip) < options.idle_traction)
     wheels = range(len(rig.wheels))
     idles, drags, stood = ([i for i in wheels if lasts(at[:, i], data.sustained)] for at in (idle, dragged, stands))
     if 2 * len(drags) > len(wheels) or lasts(np.asarray((stands & rolls).all(axis=1)), data.sustained):
@@ -372,8 +367,7 @@ def _jumps(data: ConsistencyInput) -> bool:
     noise = np.sqrt(change_variance(window.variance["ground_speed"], lag))
     reported = np.abs(data.bin * moving_sum(zero_if_unknown(window.acceleration), lag))
     most = neighbours(np.pad(reported, late), 2 * late + 1).max(axis=1)
-    with np.errstate(invalid="ignore"):
-        stands_out = (jump > data.options.significant_sd * noise) & (most < data.options.scatter * jump)
+    stands_out = (jump > data.options.significant_sd * noise) & (most < data.options.scatter * jump)
     return bool((data.driving[lag:] & stands_out).any())
 
 
@@ -392,9 +386,8 @@ def draft_sign(data: ConsistencyInput) -> Iterator[str]:
     of_thrust = (variance["torque"] / rig.radius**2).sum(axis=1)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
     driven, pull = change(thrust, lag), change(pulled, lag)
-    with np.errstate(invalid="ignore"):
-        stands_out = np.abs(driven) > options.significant_sd * np.sqrt(change_variance(of_thrust, lag))
-        stands_out &= np.abs(pull) > options.significant_sd * np.sqrt(change_variance(of_pull, lag))
+    stands_out = np.abs(driven) > options.significant_sd * np.sqrt(change_variance(of_thrust, lag))
+    stands_out &= np.abs(pull) > options.significant_sd * np.sqrt(change_variance(of_pull, lag))
     opposite = neighbours((driven * pull)[stands_out] < 0.0, data.compared).sum(axis=-1)
     if median(pulled * thrust) < 0.0 and (opposite >= options.usual_share * data.compared).any():
         yield "draft"

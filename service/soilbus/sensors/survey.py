@@ -274,6 +274,7 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
 # --- signals compared with each other ---
 
 
+@np.errstate(invalid="ignore", divide="ignore")  # of values that are not known
 def _compare(facts: Facts, findings: list[Finding], channels: Iterable[Channel], database: Database) -> list[str]:
     """Add what checks find, each without the channels that an earlier one has named; return open questions."""
     facts = facts.less(name for f in findings for name in f.channels)

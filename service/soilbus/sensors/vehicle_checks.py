@@ -158,8 +158,7 @@ def _directions(facts: Facts) -> Iterator[Finding]:
     """Wheels that turn or drive in the opposite direction to most."""
     rig, raw = facts.rig, facts.raw
     moving = facts.straight
-    with np.errstate(invalid="ignore"):
-        turns = [median(np.sign(raw.speed[moving, i])) for i in range(len(rig.wheels))]
+    turns = [median(np.sign(raw.speed[moving, i])) for i in range(len(rig.wheels))]
     forward_sign = np.sign(np.nansum(turns))
     for wheel, turn in zip(rig.wheels, turns, strict=True):
         if turn * forward_sign < 0.0:
@@ -184,15 +183,15 @@ def _directions(facts: Facts) -> Iterator[Finding]:
 
 
 def _gears(facts: Facts) -> Iterator[Finding]:
-    """Motor speeds against wheel speeds; an unmapped motor speed may also be the wheel's own.
+    """Speeds of what turns together: motor and wheel, an axle's motor and the mean of its wheels, locked wheels.
 
-    The speed of an axle's motor against the mean of its wheels, which any differential keeps.
+    An unmapped motor speed may also be the wheel's own.  Any differential keeps the mean of its wheels.  Each of two
+    locked wheels is known to half of what a gear's two speeds may differ by.
     """
     ratios: list[tuple[str, Wheel | Axle, float, list[str], str]] = []
     for i, wheel in enumerate(facts.rig.wheels):
         own = next(w for w in facts.config.wheel if w.name == wheel)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
+        ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
         is_own = (
             f"motor_speed.{wheel}" not in facts.mapped and _log_off(own.gear_ratio * ratio) < CONSISTENCY.gear_slack
         )
@@ -203,8 +202,7 @@ def _gears(facts: Facts) -> Iterator[Finding]:
         pair = [facts.rig.wheels.index(name) for name in names if name in facts.rig.wheels]
         if axle.name not in facts.shaft or axle.motor_speed is None or len(pair) != 2:
             continue
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = median((facts.shaft[axle.name] / facts.raw.speed[:, pair].mean(axis=1))[facts.straight])
+        ratio = median((facts.shaft[axle.name] / facts.raw.speed[:, pair].mean(axis=1))[facts.straight])
         if ratio < 0.0:
             text = f"axle.{axle.name}.motor_speed: turns backward while its wheels turn forward: sign = -1?"
             yield fault(text, f"torque.{axle.name}", f"speed.{axle.name}")
@@ -220,22 +218,17 @@ def _gears(facts: Facts) -> Iterator[Finding]:
             f"torque.{of.name}",
             f"{'motor_speed' if isinstance(of, Wheel) else 'speed'}.{of.name}",
         )
-
-
-def _locked(facts: Facts) -> Iterator[Finding]:
-    """Speeds left and right behind a locked differential, each known to half of what a gear's two may differ by."""
     for axle in facts.config.axle:
-        own = [w for w in facts.config.wheel if w.axle == axle.name and w.driven and w.speed is not None]
-        if axle.differential != "locked" or len(own) != 2:
+        both = [w for w in facts.config.wheel if w.axle == axle.name and w.driven and w.speed is not None]
+        if axle.differential != "locked" or len(both) != 2:
             continue
-        one, other = (facts.raw.speed[:, facts.rig.wheels.index(w.name)] for w in own)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            apart = median(np.abs(one / other - 1.0)[facts.straight])
+        one, other = (facts.raw.speed[:, facts.rig.wheels.index(w.name)] for w in both)
+        apart = median(np.abs(one / other - 1.0)[facts.straight])
         if apart > CONSISTENCY.gear_slack / 2.0:
             yield fault(
-                f'axle.{axle.name}.differential = "locked", but the speeds of {own[0].name} and {own[1].name} differ by'
-                f' {apart:.1%} straight on: "open" or "limited"?',
-                *(f"speed.{w.name}" for w in own),
+                f'axle.{axle.name}.differential = "locked", but the speeds of {both[0].name} and {both[1].name} differ'
+                f' by {apart:.1%} straight on: "open" or "limited"?',
+                *(f"speed.{w.name}" for w in both),
             )
 
 
@@ -514,8 +507,7 @@ def _yaw(facts: Facts) -> Iterator[Finding]:
     left, right = pairs(rig)
     rims = rig.radius * window.speed
     sides = np.sign(rims[:, right] - rims[:, left])
-    with np.errstate(invalid="ignore"):
-        turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(sides.sum(axis=1)) == sides.shape[1])
+    turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(sides.sum(axis=1)) == sides.shape[1])
     if turns.sum() < facts.bins(2.0):
         raise UndecidableError("no turns: the sign of the yaw rate, and which wheels are left, cannot be decided")
     if median((sides[:, 0] * np.sign(window.yaw_rate))[turns]) < 0.0:
@@ -550,7 +542,7 @@ def _radius_open(facts: Facts) -> Iterator[Finding]:
 
 
 CHECKS = (
-    _weight, _one_axle, _directions, _gears, _locked, _free_wheels, _slips, _balance, _levels, _transfer, _sides,
+    _weight, _one_axle, _directions, _gears, _free_wheels, _slips, _balance, _levels, _transfer, _sides,
     _wheel_based, _accelerometer, _slope, _yaw, _radius_open,
 )  # fmt: skip
 """Each with the channels that no check before it has named."""
