@@ -12,12 +12,16 @@ from driven_windows import task_of, tasks
 from other_wheel import Contact, readings
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.linearisation import Optimum
+from soilbus.estimation.model_form import with_form_step
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import window_of_samples
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.outputs import json_line
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
+from soilbus.terra.wheel import WheelModel
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
 CONFIG = reference_configuration()
@@ -135,3 +139,30 @@ def test_an_effect_that_names_the_form_closes_it():
     task = next(tasks(CONFIG, excited("loam", 10.5), seed=1))
     named, unnamed = (WindowEstimator(config).solve(task) for config in (closed, CONFIG))
     assert named.bearing.std < unnamed.bearing.std
+
+
+@pytest.mark.parametrize("driven", [(True, True, True, True), (False, False, True, True)])
+def test_derivatives_by_the_form_are_those_of_other_forms(driven):
+    rig = replace(rig_of(CONFIG), driven=np.array(driven))
+    window = next(tasks(CONFIG, excited("loam", 10.5), seed=1)).window
+    window = replace(window, torque=np.where(driven, window.torque, np.nan), curves={})
+    soil, size = soil_named("loam"), 0.002
+
+    def at(model: WheelModel) -> tuple[ObservationModel, Optimum]:
+        problem = ObservationModel(window, rig, model, 0.1)
+        gains, latents = np.zeros(len(problem.gain_names)), problem.start(soil)
+        for _ in range(6):  # until the slips of free wheels leave them no torque
+            one = problem.linearise(soil, gains, latents)
+            speed = latents.speed.copy()
+            speed[:, ~rig.driven] = latents.ground_speed[:, None] / rig.radius[~rig.driven] / (1.0 - one.rolling_slip)
+            latents = problem.with_entry_angles(latents._replace(speed=speed), soil)
+        one = problem.linearise(soil, gains, latents)
+        return problem, Optimum(problem.t, np.asarray(soil), gains, latents, one)
+
+    problem, optimum = at(WheelModel())
+    by_form = problem.by_form(optimum)[0].reshape(problem.n, -1, len(FORM))[:, len(driven)]
+    for i, (name, sign) in enumerate(zip(FORM, (-1.0, 1.0, 1.0, 1.0), strict=True)):
+        step = sign * size * (np.arange(len(FORM)) == i)
+        change = (at(with_form_step(WheelModel(), step))[1].at.rows - optimum.at.rows)[:, 0]
+        off = change.reshape(problem.n, -1)[:, len(driven)] / (sign * size) - by_form[:, i]
+        assert np.abs(off).mean() < 0.03 * np.abs(by_form[:, i]).mean(), name

@@ -135,19 +135,23 @@ class Response(NamedTuple):
     by_effects: Array  # (3, P, N, W)
 
     def rolling(self, free: NDArray[np.bool_]) -> Response:
-        """The response with the slips of free wheels (mask (W,)) eliminated by T = 0, to first order.
-
-        y <- y - (dy/ds) / (dT/ds) T for pull and sinkage and all their derivatives; nothing depends on their speeds.
-        """
-        torque = self.by_speed[1][:, free]
-        ratio = self.by_speed[:, :, free] / np.where(torque == 0.0, np.inf, torque)
-        for values in (self.value, self.by_load):
-            values[:, :, free] -= ratio * values[1][:, free]
-        for values in (self.by_soil, self.by_effects):
-            values[..., free] -= ratio[:, None] * values[1][..., free]
-        self.by_speed[:, :, free] = 0.0
+        """The response with the slips of free wheels (mask (W,)) eliminated; nothing depends on their speeds."""
+        by_slip = self.by_speed.copy()
+        for values in (self.value, self.by_load, self.by_soil, self.by_effects, self.by_speed):
+            eliminate_slip(values, by_slip, free)
         self.by_ground[:, :, free] = 0.0
         return self
+
+
+def eliminate_slip(values: Array, by_slip: Array, free: NDArray[np.bool_]) -> None:
+    """Take the slips of free wheels (mask (W,)) out of values (3, ..., N, W) by T = 0, to first order, in place.
+
+    y <- y - (dy/ds) / (dT/ds) T for pull, torque and sinkage or their derivatives; by_slip (3, N, W): those by the slip
+    or what it follows.
+    """
+    torque = by_slip[1][:, free]
+    ratio = by_slip[:, :, free] / np.where(torque == 0.0, np.inf, torque)
+    values[..., free] -= ratio.reshape(3, *[1] * (values.ndim - 3), *torque.shape) * values[1][..., free]
 
 
 class DelayTerms(NamedTuple):

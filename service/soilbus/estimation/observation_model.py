@@ -45,6 +45,7 @@ from soilbus.estimation.linearisation import (
     Optimum,
     Response,
     Work,
+    eliminate_slip,
 )
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window
@@ -423,14 +424,18 @@ class ObservationModel(Measurements):
         if model.shear_law == "exponential":  # the same law as a share of 1, which can be reduced
             model, other = replace(model, shear_law="rational", exponential_share=1.0), -1.0
         _, d = wheel_forces_and_derivatives(state, model, ("peak", "leave", "exponential_share"))
-        by_angle, by_form = d[:, 0].reshape(3, *shape), d[:, len(INPUTS) :].reshape(3, 3, *shape)
+        d = d.reshape(3, -1, *shape)
+        by_angle, by_slip, by_form = d[:, 0], d[:, 1], d[:, len(INPUTS) :]
         by_form[:, 1] *= -1.0
         by_form[:, 2] *= other
-        angle_by_form = -by_form[0] / by_angle[0]
-        out = np.empty((3, 3, *shape))
-        out[:2] = by_form[1:] + by_angle[1:, None] * angle_by_form
-        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle[instants]) * angle_by_form
-        return out
+        by_load = by_angle / by_angle[0]
+        of_sinkage = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle[instants]) / by_angle[0]
+        held, held_slip = (
+            np.concatenate([by[1:] - by_load[1:, None] * by[0], -of_sinkage * by[:1]])
+            for by in (by_form, by_slip[:, None])
+        )
+        eliminate_slip(held, held_slip[:, 0], self.rolls)
+        return held
 
     def _wheels_in_contact(
         self, soil: Soil, gains: Array, latents: Latents, instants: NDArray[np.intp]
