@@ -7,8 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instants import averaged
+from soilbus.estimation.window import window_of_samples
+from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
+
+CONFIG = reference_configuration()
+WHEELS = rig_of(CONFIG).wheels
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +36,7 @@ def test_means_of_the_known_bins(window, length) -> None:
     means, bins = averaged(window, end, length), instants_of(window, end, length)
     assert len(means.t) == len(bins)
     assert means.t == pytest.approx([window.t[b].mean() for b in bins], abs=1e-6)
-    for quantity in ("torque", "speed", "ground_speed", "draft"):
+    for quantity in ("torque", "ground_speed", "draft"):
         value, variance = getattr(window, quantity), window.variance[quantity]
         for i, b in enumerate(bins):
             n = np.isfinite(value[b]).sum(axis=0)
@@ -38,6 +44,17 @@ def test_means_of_the_known_bins(window, length) -> None:
             known = np.where(np.isfinite(variance[b]), variance[b], 0.0)
             counted = np.isfinite(variance[b]).sum(axis=0)
             assert means.variance[quantity][i] == pytest.approx(known.sum(axis=0) / counted**2)
+
+
+def test_the_slip_of_an_instant_is_the_mean_of_its_bins() -> None:
+    t = np.arange(0.05, 10.0, 0.1)
+    swinging = 1.0 + 0.4 * np.sin(2.0 * np.pi * 1.7 * t)[:, None] * [0.1, 0.5, 1.0, 1.0]
+    window = window_of_samples(rig_of(CONFIG), t, {f"speed.{w}": 3.0 * swinging[:, i] for i, w in enumerate(WHEELS)})
+    window = replace(window, ground_speed=np.full(len(t), 1.2))
+    means = averaged(window, 10.0, 0.5)
+    of_bins = (1.2 / window.speed).reshape(-1, 5, 4).mean(axis=1)
+    assert 1.2 / means.speed == pytest.approx(of_bins)
+    assert np.abs(means.speed / window.speed.reshape(-1, 5, 4).mean(axis=1) - 1.0).max() > 0.05
 
 
 def test_unknown_where_no_bin_is_known(window) -> None:

@@ -145,10 +145,10 @@ def record_of(
         Where the recording has not enough usable instants.
     """
     end, span = (float(window.t[-1]), float(np.ptp(window.t))) if len(window.t) else (0.0, 0.0)
-    length = min(options.instant, span / (2 * options.folds * options.min_sample))
+    length = min(instant_of(rig, options.instant), span / (2 * options.folds * options.min_sample))
     bins, problem = (
         ObservationModelWithEffects(part, diagnosed(rig), model, min_speed, max_turn).with_own_stamps().on_curves()
-        for part in (window, averaged(window, end, instant_of(rig, length)))
+        for part in (window, averaged(window, end, length))
     )
     problem = problem.on_bumps()
     fold = folds(problem.since, options)

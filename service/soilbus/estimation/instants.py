@@ -1,6 +1,7 @@
 """Instants: means of a window's bins over whole cycles of a machine that shakes.
 
     y_i = mean of the known y_b,    var y_i = sum of var y_b / n^2         n bins b of an instant i
+    omega_i = 1 / mean (1 / omega_b)                                       so that 1 - V / (r omega) is the mean slip
 
 A model of steady wheels holds in the mean of a cycle only.  Within one, loads, slips and torques also follow each other
 by relaxation, inertia and filters.  What these leave of a fit passes for curvature of torque over slip, and so for
@@ -21,9 +22,15 @@ _QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
 
 
 def instant_of(rig: Rig, length: float) -> float:
-    """Return the length [s] of a machine's instants; 0, bins as they are, on tracks: no tyre relaxes or bounces."""
-    lengths = rig.lengths
-    return 0.0 if lengths is not None and (lengths > 0.0).all() else length
+    """Return the length [s] of a machine's instants, this or a bounce where loads are computed.
+
+    It is 0, bins as they are, on tracks: no tyre relaxes or bounces.
+    """
+    lengths, given = rig.lengths, rig.instrumentation
+    if lengths is not None and (lengths > 0.0).all():
+        return 0.0
+    computed = given is not None and given.loads_at_prior.any()
+    return max(length, rig.options.measurements.bounce_period) if computed else length
 
 
 def averaged(window: Window, end: float, length: float) -> Window:
@@ -44,6 +51,8 @@ def averaged(window: Window, end: float, length: float) -> Window:
         variances += [given.torque_var, given.variance]
     means = _means(values, starts, 1), _means(variances, starts, 2)
     value, variance = (dict(zip(_QUANTITIES, part, strict=False)) for part in means)
+    with np.errstate(divide="ignore"):
+        value["speed"] = 1.0 / _means([1.0 / window.speed], starts, 1)[0]
     if given is not None:
         (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
         given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)

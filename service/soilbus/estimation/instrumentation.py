@@ -116,6 +116,11 @@ class Instrumentation:
         ])  # fmt: skip
 
     @cached_property
+    def loads_at_prior(self) -> NDArray[np.bool_]:
+        """Which rows of loads (W,) neither a load cell nor torques measure."""
+        return np.array([row.kind != "channel" for row in self.load]) & ~self.loads_by_torques
+
+    @cached_property
     def sides(self) -> tuple[tuple[int, int], ...]:
         """Row of torques and row of loads of each two wheels with equal torques and computed loads."""
         return tuple(

@@ -245,8 +245,7 @@ class Measurements:
         if given is not None:
             self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
             self._from_observed = given.from_observed
-            computed = np.array([row.kind != "channel" for row in given.load])
-            self._prior_only[: len(given.load)] = computed & ~given.loads_by_torques
+            self._prior_only[: len(given.load)] = given.loads_at_prior
             self._sides = given.sides
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 

@@ -25,6 +25,9 @@ class MeasurementOptions:
     load_time_scale: float = 0.1
     """Integral time scale T [s] of loads that shake, 2 T rms^2 / bin the variance of a bin's.  With 0.02 s intervals
     are too narrow."""
+    bounce_period: float = 0.5
+    """Least length [s] of an instant where loads are computed: a body bounces on its tyres at 1.5 to 3 Hz, and slip
+    follows loads that nobody measures.  With 0.25 a loader on two driven wheels seems to have a negative inertia."""
     unknown_slope: float = 0.4
     """Sd of a slope [rad] in one instant where no sensor shows it and nothing is towed, and of an axle's loads left
     less right over their sum where no roll is measured: 3 degrees for seconds, 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
