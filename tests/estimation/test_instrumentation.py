@@ -138,10 +138,6 @@ def test_each_machine_has_as_many_independent_rows_as_wheels(machine):
         assert np.linalg.matrix_rank([row.weight for row in rows]) == 4
 
 
-def test_four_motors_and_four_cells_need_no_instrumentation(tmp_path):
-    assert rig_of(configured(tmp_path, PLAIN)).instrumentation is None
-
-
 def test_loads_of_every_machine_add_up_to_the_weight(machine):
     config, _ = machine
     rig = rig_of(config)
@@ -206,6 +202,7 @@ def test_a_signal_of_two_wheels_says_less_than_two_sensors(tmp_path):
     text = PLAIN.replace("AxleLoads.FR", "AxleLoads.FL").replace("WheelSpeeds.RR", "WheelSpeeds.RL")
     shared = configured(tmp_path, text)
     assert rig_of(shared).instrumentation is not None
+    assert rig_of(apart).instrumentation is None  # four motors and four cells need none
     said, soil = [], np.array(soil_named("loam"))
     for config in (apart, shared):
         rig, prior = rig_of(config), prior_of(config)
