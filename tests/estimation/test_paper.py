@@ -183,6 +183,19 @@ def test_figures_of_the_notes():
     assert as_print(found)[1:] == pytest.approx((110.0, 0.36), rel=0.03)
 
 
+def test_noise_of_a_tenth_of_a_per_cent_leaves_K_L_open():
+    """The Cramer-Rao bound of one instant, as the page of equations has it."""
+    x, exact = WET_CLAY.truth, WheelEquations(CLAY, EXACT)
+    y = np.array(exact.forces(x))
+    covariance = np.diag((0.001 * y) ** 2)
+    for name, sd, h in (("sinkage", 1e-4, 1e-6), ("slip", 1e-3, 1e-6)):
+        ends = (CLAY._replace(**{name: getattr(CLAY, name) + d}) for d in (h, -h))
+        high, low = (np.array(WheelEquations(end, EXACT).forces(x)) for end in ends)
+        covariance += np.outer(high - low, high - low) * (sd / (2.0 * h)) ** 2
+    inverse = np.linalg.inv(exact.jacobian(x))
+    assert np.sqrt((inverse @ covariance @ inverse.T)[0, 0]) / x.K_L == pytest.approx(5.59, abs=0.01)
+
+
 def unexplained(point: OperatingPoint, measured: Forces, n: np.ndarray) -> np.ndarray:
     """What the best K_L and K_L tan(phi) leave over at exponents n, over W."""
     left = []
