@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Decoded, Reason
 from soilbus.can.checksum import frame_checksum
-from soilbus.can.j1939 import SourceLock, pgn_of
+from soilbus.can.j1939 import SourceLock
 
 DBC = """
 BO_ 256 Loads: 4 X
@@ -370,12 +370,6 @@ def test_of_two_receivers_one_counts_though_positions_come_every_5_s() -> None:
     for i in range(8):
         a.feed(2.5 * i, place | (0x40, 0x41)[i % 2], True, bytes.fromhex("00752B7D00752B7D"))
     assert a.take().columns["latitude"].t.tolist() == [0.0, 5.0, 10.0, 15.0]
-
-
-def test_groups_of_both_formats() -> None:
-    assert pgn_of(0x18FE4997) == 65097
-    assert pgn_of(0x19F80117) == 129025
-    assert pgn_of(0x18EFFF06) == pgn_of(0x18EF0006) == 0xEF00  # the second byte is a destination
 
 
 def passes(filters: list[dict[str, Any]], identifier: int, extended: bool) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,12 @@ from cantools.database.errors import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from field_data import FIELD, field_database, frames_of, needs_field
+from soilbus.can.dbc_files import load_databases
 from soilbus.can.decode import ColumnDecoder
+from soilbus.config.file import load_config
+from soilbus.offline.replay import read_frames
+
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 
 SCALES = st.one_of(
     st.sampled_from([1, 1.0, 2, 3, -1, -2.0, 0.1, 0.001, 0.05, 1e-9, -0.25, 10**10, 2**40, 1 / 3]),
@@ -190,13 +195,12 @@ def test_signals_that_cannot_be_cut_out() -> None:
         ColumnDecoder(long, ["Txet"])
 
 
-@needs_field
-def test_field_recording_equals_cantools() -> None:
-    database = field_database()
+def test_field_recording_equals_cantools(field_recording) -> None:
+    database = load_databases(load_config(FIELD))
     rows: dict[int, list[bytes]] = {}
-    for _, identifier, _, data in frames_of(FIELD / "clay.log.gz"):
+    for _, identifier, _, data, *_ in read_frames(field_recording("clay.log.gz")):
         if len(rows.setdefault(identifier, [])) < 400:
-            rows[identifier].append(data)
+            rows[identifier].append(bytes(data))
     assert len(rows) == 9
     for identifier, frames in rows.items():
         assert_equal_to_cantools(database.get_message_by_frame_id(identifier), frames)

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from cantools.database.can import Database
 
-from field_data import field_config, needs_field
 from soilbus.can.admission import Admission
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import checked_messages, load_databases
@@ -276,27 +275,6 @@ def test_shipped_files_are_found_by_name_and_checked(tmp_path: Path, monkeypatch
     assert checked_messages(config(work, "ours.dbc"), Database()) == {"Ours"}
     (work / "ours.dbc").write_text(text, encoding="utf-8")  # the integrator's own file comes first
     assert checked_messages(config(work, "ours.dbc"), Database()) == frozenset()
-
-
-def test_reference_tractor_of_the_checkout() -> None:
-    c = parse_config({"dbc": {"input": ["tractor.dbc"]}})
-    database = load_databases(c)
-    assert shipped_dbc("tractor.dbc").parent.name == "dbc"
-    assert checked_messages(c, database) <= {m.name for m in database.messages}
-    assert checked_messages(c, database)
-
-
-@needs_field
-def test_field_vehicle() -> None:
-    c = field_config()
-    database = load_databases(c)
-    found = channels_of(c, database)
-    assert len(found) == 20
-    assert without_unit(found, database) == []
-    assert checked_messages(c, database) == frozenset()
-    factors = {channel.name: channel.factor for channel in found}
-    assert (factors["torque.FL"], factors["speed.FL"], factors["sinkage.RR"]) == (24.0, 1.0, 1e-3)
-    assert len(Admission(found, database).can_filters()) == 10
 
 
 @pytest.mark.parametrize(

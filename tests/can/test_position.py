@@ -71,26 +71,6 @@ def test_one_clear_line_for_a_fault(tmp_path, signals, fault):
     assert fault in error.value.faults[0]
 
 
-@pytest.mark.parametrize(
-    ("dbc", "message", "identifier", "payload", "place"),
-    [
-        ("iso11783.dbc", "VehiclePosition", 0x18FEF380, "b2a86b9c412afc7b", (52.4301234, -1.9876543)),
-        ("nmea2000.dbc", "PositionRapidUpdate", 0x0DF80103, "829f491743836cd2", (39.0700930, -76.4640445)),
-    ],
-)
-def test_standard_positions_from_any_source_and_priority(tmp_path, dbc, message, identifier, payload, place):
-    channels, database = mapped(tmp_path, f"{message}.Latitude", f"{message}.Longitude", dbc)
-    admission = Admission(channels.values(), database)
-    unavailable = "ffffffff" * 2 if dbc == "iso11783.dbc" else "ffffff7f" * 2
-    for t, data in enumerate((payload, unavailable, payload)):
-        admission.feed(float(t), identifier, True, bytes.fromhex(data))
-    decoded = admission.take()
-    for name, expected in zip(("latitude", "longitude"), place, strict=True):
-        assert np.degrees(decoded.columns[name].value) == pytest.approx([expected, expected], abs=1e-9)
-        assert decoded.columns[name].t.tolist() == [0.0, 2.0]
-    assert {str(reason) for _, reason in decoded.refused} == {"not_available"}
-
-
 def test_the_corners_of_the_map_are_on_it(tmp_path):
     channels, database = mapped(
         tmp_path, "PositionRapidUpdate.Latitude", "PositionRapidUpdate.Longitude", "nmea2000.dbc"

@@ -74,22 +74,6 @@ def test_ends_of_the_range_are_values_and_beyond_is_an_error():
     assert slip(-1e300) == "error"
 
 
-def test_standard_deviations_stay_at_the_top_but_never_go_below():
-    publisher = Publisher(DATABASE)
-
-    def std(x):
-        return decoded(publisher.frame("SoilStrength", {"BearingPressureStd": x}))["BearingPressureStd"]
-
-    assert std(1e9) == 3212.0
-    assert std(-1.0) == "error"
-
-
-def test_names_of_the_value_table_are_values():
-    publisher = Publisher(DATABASE)
-    back = decoded(publisher.frame("Traversability", {"State": "no_go", "LimitingCause": "torque"}))
-    assert (back["State"], back["LimitingCause"], back["Probability"]) == ("no_go", "torque", "not_available")
-
-
 @pytest.mark.parametrize("message", [m.name for m in DATABASE.messages])
 def test_counter_goes_up_by_one_in_each_message_alone(message):
     publisher = Publisher(DATABASE)
@@ -133,13 +117,6 @@ def test_reserved_bits_are_ones():
     assert data[0] == 0xF0
     assert data[4] == 0xFF
     assert data[6] & 0x0F == 0x0F
-
-
-def test_schedule_is_the_cycle_time_of_the_dbc():
-    schedule = Publisher(DATABASE).schedule
-    assert schedule == {message.name: message.cycle_time / 1000.0 for message in DATABASE.messages}
-    assert schedule["Traversability"] == 0.1
-    assert schedule["SoilStrength"] == 1.0
 
 
 @pytest.mark.parametrize(

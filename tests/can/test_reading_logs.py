@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import gzip
 import lzma
 import struct
 import subprocess
@@ -20,7 +21,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.can.logs import Log, LogError
 from soilbus.config.file import parse_config
 from soilbus.config.model import ConfigError
-from soilbus.offline.replay import channel_notes, replay
+from soilbus.offline.replay import channel_notes, read_frames, replay
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 
@@ -109,6 +110,30 @@ def test_a_log_of_constant_data_is_no_bomb(tmp_path: Path) -> None:
     with lzma.open(path, "wb") as file:
         file.writelines(b"(%.6f) can0 123#0000000000000000\n" % (1.7e9 + n) for n in range(100_000))
     assert sum(1 for _ in Log(path).frames()) == 100_000
+
+
+@pytest.mark.parametrize("kind", [".log", ".log.gz", ".asc", ".csv"])
+def test_a_line_without_end_is_damage_and_takes_no_memory(kind: str, tmp_path: Path) -> None:
+    head = tmp_path / f"head{kind.removesuffix('.gz')}"
+    with can.Logger(head) as writer:
+        for i in range(300):
+            writer(
+                can.Message(timestamp=1.7e9 + i / 100.0, arbitration_id=0x123, is_extended_id=False, data=b"soilbus!")
+            )
+    path = tmp_path / f"endless{kind}"
+    with gzip.open(path, "wb", compresslevel=1) if kind.endswith(".gz") else path.open("wb") as file:
+        file.write(head.read_bytes().removesuffix(b"End TriggerBlock\n"))
+        for _ in range(64):
+            file.write(b"0" * 2**20)
+    before: list[object] = []
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=r"a line of more than \d+ characters"):
+            before.extend(read_frames(path))
+        assert tracemalloc.get_traced_memory()[1] < 8 * 2**20
+    finally:
+        tracemalloc.stop()
+    assert len(before) == 300
 
 
 MUX = """VERSION ""

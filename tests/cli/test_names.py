@@ -39,9 +39,10 @@ PIECES = (
 )  # fmt: skip
 """What acts in some format: terminal, CSV, TOML, HTML, XML, JSON, TeX, rich's markup, Python's formats, a shell."""
 RNG = random.Random(47)
-UNTIDY = ["=cmd|' /C calc'!A0", "-rf", "\x1b[2J\x1b[31mred\nFORGED", "<img src=x onerror=alert(1)>\u202e"] + [
-    "".join(RNG.sample(PIECES, 5)) for _ in range(2)
-]
+UNTIDY = [
+    "=cmd|' /C calc'!A0", "-rf", "\x1b[2J\x1b[31mred\nFORGED<img src=x onerror=alert(1)>\u202e",
+    "".join(RNG.sample(PIECES, 10)),
+]  # fmt: skip
 INJECTION = '"\n[mqtt]\nhost="evil.example"\n#'
 HUGE = "n" * 10_000
 NO_UTF8 = os.fsdecode(b"bytes\xff\xfe")

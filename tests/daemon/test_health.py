@@ -99,12 +99,6 @@ def over_and_over(moments, seconds: float):
             )  # fmt: skip
 
 
-def test_a_good_service_is_left_alone(moments):
-    bench = WatchedBench(moments, 20.0)
-    began = bench.run(20.0)
-    assert not bench.systemd.would_restart(began)
-
-
 def test_silence_is_no_reason_to_restart(moments):
     bench = WatchedBench(moments, 5.0)
     began = bench.run(LONG)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shutil
 import subprocess
 from collections import defaultdict
 from pathlib import Path
@@ -12,26 +10,12 @@ import can
 import cantools
 import pytest
 
-from availability import unavailable
 from soilbus.can.checksum import frame_checksum
 
 DBC = Path(__file__).resolve().parents[2] / "dbc"
-PAGE = (DBC / "README.md").read_text(encoding="utf-8")
 DATABASE = cantools.database.load_file(DBC / "soilbus.dbc", strict=True)
 LEAST_FIRST = ("unknown", "no_go", "caution", "go")
 SAMPLE = list(can.LogReader(DBC / "sample.log"))
-
-
-@pytest.fixture(scope="module")
-def reader(tmp_path_factory) -> Path:
-    """The page's C blocks, compiled as the page says."""
-    if shutil.which("gcc") is None:
-        unavailable("no gcc")
-    folder = tmp_path_factory.mktemp("verdict")
-    (folder / "verdict.c").write_text("\n".join(re.findall(r"```c\n(.*?)```", PAGE, re.S)), encoding="utf-8")
-    command = re.search(r"`(gcc [^`]*?) && \./verdict < sample\.log`", PAGE)[1]
-    subprocess.run([*command.split(), "-Wextra", "-pedantic"], cwd=folder, check=True)
-    return folder / "verdict"
 
 
 def read(program: Path, log: str) -> list[str]:
@@ -51,7 +35,7 @@ def test_the_sample_is_a_minute_of_every_frame_of_a_vehicle_with_four_wheels():
         assert counter == [i % 16 for i in range(len(counter))], name
 
 
-def test_the_reader_says_what_cantools_decodes(reader):
+def test_the_reader_says_what_cantools_decodes(verdict_reader):
     verdicts = [
         (message.timestamp, str(DATABASE.decode_message(message.arbitration_id, message.data)["State"]))
         for message in SAMPLE
@@ -65,10 +49,10 @@ def test_the_reader_says_what_cantools_decodes(reader):
         before = now
     changes = shown
     assert {change.split()[1] for change in changes} >= {"go", "caution", "no_go"}
-    assert read(reader, (DBC / "sample.log").read_text()) == [*changes, f"{len(verdicts)} good, 0 refused"]
+    assert read(verdict_reader, (DBC / "sample.log").read_text()) == [*changes, f"{len(verdicts)} good, 0 refused"]
 
 
-def test_the_reader_refuses_what_is_broken_or_repeated_and_forgets_what_is_stale(reader):
+def test_the_reader_refuses_what_is_broken_or_repeated_and_forgets_what_is_stale(verdict_reader):
     ident = DATABASE.get_message_by_name("Traversability").frame_id
 
     def line(t: float, counter: int, spoil: int = 0, length: int = 8) -> str:
@@ -80,4 +64,9 @@ def test_the_reader_refuses_what_is_broken_or_repeated_and_forgets_what_is_stale
     row = "".join(line(0.5 + 0.1 * i, 12 + i & 15) for i in range(6))
     bad = line(1.1, 1) + line(1.2, 2, spoil=1) + line(1.25, 2, length=7) + other
     again = "".join(line(2.1 + 0.1 * i, 2 + i) for i in range(6))
-    assert read(reader, row + bad + again) == ["1.000000 go", "2.000000 unknown", "2.600000 go", "12 good, 3 refused"]
+    assert read(verdict_reader, row + bad + again) == [
+        "1.000000 go",
+        "2.000000 unknown",
+        "2.600000 go",
+        "12 good, 3 refused",
+    ]

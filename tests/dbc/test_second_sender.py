@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shutil
 import subprocess
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from availability import unavailable
 from soilbus.can.checksum import frame_checksum
 from soilbus.report.received_frames import ReceivedFrames
 
@@ -54,24 +51,11 @@ def shown_by_python(frames: list[Sent]) -> list[tuple[float, str]]:
     return said
 
 
-@pytest.fixture(scope="module")
-def program(tmp_path_factory) -> Path:
-    """The page's C blocks, compiled as the page says."""
-    if shutil.which("gcc") is None:
-        unavailable("no gcc")
-    folder = tmp_path_factory.mktemp("verdict")
-    page = (DBC / "README.md").read_text(encoding="utf-8")
-    (folder / "verdict.c").write_text("\n".join(re.findall(r"```c\n(.*?)```", page, re.S)), encoding="utf-8")
-    command = re.search(r"`(gcc [^`]*?) && \./verdict < sample\.log`", page)[1]
-    subprocess.run(command.split(), cwd=folder, check=True)
-    return folder / "verdict"
-
-
 @pytest.fixture(scope="module", params=["python", "c"])
-def shown(request, program) -> Shown:
+def shown(request, verdict_reader) -> Shown:
     def by_c(frames: list[Sent]) -> list[tuple[float, str]]:
         log = "".join(f"({f.t:.6f}) can0 {IDENTIFIER:08X}#{f.payload.hex().upper()}\n" for f in frames)
-        done = subprocess.run([program], input=log, text=True, capture_output=True, check=True)
+        done = subprocess.run([verdict_reader], input=log, text=True, capture_output=True, check=True)
         changes = [line.split() for line in done.stdout.splitlines()[:-1]]
         return [(0.0, "unknown"), *((float(t), state) for t, state in changes)]
 

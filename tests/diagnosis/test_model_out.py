@@ -74,16 +74,6 @@ def test_overrides_and_comments_are_kept(tmp_path):
     tomllib.loads(path.read_text())
 
 
-def test_effects_in_the_file_are_replaced(tmp_path):
-    first = written(tmp_path, [{"name": "lugs", "height": 0.03}])
-    text = with_effects_text(first, [], [{"name": "multipass", "stiffness": 0.5}], tmp_path)
-    assert [effect["name"] for effect in tomllib.loads(text)["model"]["effects"]] == ["multipass"]
-    block = first.read_text().split("[model]")[0] + '[[model.effects]]\nname = "lugs"\nheight = 0.03\n'
-    first.write_text(block)
-    text = with_effects_text(first, [], [{"name": "multipass", "stiffness": 0.5}], tmp_path)
-    assert [effect["name"] for effect in tomllib.loads(text)["model"]["effects"]] == ["multipass"]
-
-
 @pytest.mark.parametrize("effects", [[], [{"name": "lugs", "height": 0.03}, {"name": "multipass", "stiffness": 0.5}]])
 @pytest.mark.parametrize("notes", [(), ("grade (slope) is left out", "lugs (height) is at its edge")])
 @pytest.mark.parametrize(

@@ -78,32 +78,6 @@ def test_slopes_that_differ_from_field_to_field_are_no_offset():
     assert reported == pytest.approx(slopes, abs=0.006)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a slope may change along the field, so the same push all along is sooner an offset"
-)
-def test_one_field_does_not_separate_a_slope_from_an_offset():
-    records = [field(BLIND, "loam", 0.0, 5, "draft_offset=400")]
-    found = diagnose(records, prior_of(BLIND), RIVALS)
-    assert min(chances(found)[name] for name in ("draft_offset", "grade")) > 0.1
-
-
-@pytest.mark.xfail(strict=True, reason="half a degree of pitch is not seen in means over a quarter of a second")
-def test_a_pitch_offset_is_one_of_the_vehicle():
-    """A pitch sensor that is off by 0.5 deg leaves the same push in every recording."""
-    error = np.radians(0.5)
-    records = [with_pitch_error(field(CONFIG, soil, 0.0, 70 + i), error) for i, soil in enumerate(SOILS)]
-    offset = diagnose(records, prior_of(CONFIG), [CATALOGUE["grade"]]).completed.parameters()["grade"]["pitch_offset"]
-    assert abs(offset.value - error) < 4.0 * offset.std < 0.005
-
-
-def with_pitch_error(record: Record, error: float) -> Record:
-    """The recording as if the pitch sensor had read less by `error` [rad]: by the balance alone."""
-    push = record.training.rig.chassis.mass * GRAVITY * error
-    for part in (record.training, record.held_out, record.whole):
-        part.inertia = part.inertia - push
-    return record
-
-
 def test_a_curve_has_the_mean_of_its_heights_along_the_way():
     heights = np.random.default_rng(3).normal(size=16).tolist()
     share = np.linspace(0.0, 1.0, 20001)

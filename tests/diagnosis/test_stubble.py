@@ -1,9 +1,11 @@
-"""A recording that nobody here wrote: the plain model fails on every window, the completed one on none."""
+"""A recording that nobody here wrote: its effect is named, and the completed model describes it.
+
+By the plain model the noise factor of the draft is above 5 in every window: daemon/test_pipeline.py.
+"""
 
 from __future__ import annotations
 
 import json
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +24,7 @@ def test_stubble_is_described_once_its_effect_is_in_the_model(field_recording, t
     before, after = (found["gap"][when] for when in ("before", "after"))
     assert before > 2.0 > 1.15 > after
     assert after - 1.0 < 0.06 * (before - 1.0)  # what is left: stamps of a bus cycle, 4 ms of the loads
-    status, draft = {}, {}
-    for name, config in (("plain", FIELD), ("completed", model)):
-        assert main(["replay", "--config", str(config), log, "--json", str(tmp_path / name)]) == 0
-        windows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
-        status[name] = Counter(window["status"] for window in windows)
-        draft[name] = np.median([window["noise_factors"]["draft"] for window in windows])
-    assert status["completed"]["valid"] >= 0.95 * sum(status["completed"].values()) > 100.0
-    assert draft["plain"] > 5.0 > 2.0 > draft["completed"]  # what the plain model leaves is noise to it
+    assert main(["replay", "--config", str(model), log, "--json", str(tmp_path / "windows.jsonl")]) == 0
+    windows = [json.loads(line) for line in (tmp_path / "windows.jsonl").read_text().splitlines()]
+    assert sum(window["status"] == "valid" for window in windows) >= 0.95 * len(windows) > 100.0
+    assert np.median([window["noise_factors"]["draft"] for window in windows]) < 2.0  # what was left is no noise now

@@ -12,21 +12,14 @@ DRAWS = 20_000
 
 
 @pytest.mark.parametrize(("instants", "residuals"), [(12, 5), (31, 9), (60, 9)])
-@pytest.mark.parametrize("probability", [0.01, 0.002])
-def test_noise_passes_the_threshold_as_often_as_asked(instants, residuals, probability):
+def test_noise_passes_the_threshold_as_often_as_asked(instants, residuals):
     rng = np.random.default_rng([instants, residuals])
     count = np.full(instants, float(residuals))
     largest = [log_likelihood_ratio(misfit, count).max() for misfit in rng.chisquare(residuals, (DRAWS, instants))]
-    alarms = np.count_nonzero(np.array(largest) > alarm_threshold(probability, instants, residuals))
-    low, high = binom.interval(0.99, DRAWS, probability)
-    assert 0.9 * low <= alarms <= high  # the formula is up to a tenth above the rate of draws
-
-
-def test_fewer_false_alarms_and_more_places_to_look_at_take_a_higher_threshold():
-    by_rate = [alarm_threshold(p, 31, 9) for p in (1e-2, 1e-4, 1e-6, 1e-9)]
-    by_instants = [alarm_threshold(1e-4, m, 9) for m in (1, 10, 100)]
-    assert by_rate == sorted(by_rate)
-    assert by_instants == sorted(by_instants)
+    for probability in (0.01, 0.002):
+        alarms = np.count_nonzero(np.array(largest) > alarm_threshold(probability, instants, residuals))
+        low, high = binom.interval(0.99, DRAWS, probability)
+        assert 0.9 * low <= alarms <= high  # the formula is up to a tenth above the rate of draws
 
 
 def test_a_single_instant_has_the_tail_of_chi_square():

@@ -112,13 +112,6 @@ def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sink
         assert told.traversability.state is exact.traversability.state
 
 
-@pytest.mark.parametrize("sinkage", [True, False])
-def test_without_sinkage_sensors_the_form_leaves_much_more_open(sinkage):
-    task = window_on(soil_named("loam"), Contact(), np.random.default_rng(1), sinkage)
-    result = WindowEstimator(CONFIG).solve(task)
-    assert (result.bearing.std / result.bearing.value < 0.15) is sinkage
-
-
 def test_a_pressure_says_where_it_extrapolates():
     task = next(tasks(CONFIG, excited("dry_sand", 10.5), seed=1))
     result = WindowEstimator(CONFIG).solve(task)

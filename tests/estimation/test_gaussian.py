@@ -71,22 +71,6 @@ def test_a_singular_or_badly_scaled_system_is_solved_or_refused():
         assert solve_with_inverse(np.full((2, 2), np.nan), np.zeros(2)) is None
 
 
-@pytest.mark.parametrize("std", [0.2, 0.5])
-def test_what_follows_cohesion_is_as_open_as_a_log_normal_one(std):
-    """tan phi on a line of one strength, c + p tan phi, against draws of a log-normal c."""
-    soil, pressure = Soil(1e3, 1e6, 0.7, 0.5, 2e3, 0.02), 4e4
-    c, phi = PARAMETERS.index("c"), PARAMETERS.index("phi")
-    slope = -soil.c / pressure / (soil.phi * (1.0 + np.tan(soil.phi) ** 2))  # of log phi by log c
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_([phi, c], [phi, c])] = std**2 * np.outer([slope, 1.0], [slope, 1.0])
-    posterior = Posterior(soil, covariance)
-    cohesion = soil.c * np.exp(std * np.random.default_rng(1).standard_normal(400_000))
-    expected = np.sqrt(np.mean((cohesion - soil.c) ** 2))
-    assert posterior.tan_phi().std == pytest.approx(expected / pressure, rel=0.01)
-    assert posterior.parameters()["c"].std == pytest.approx(expected, rel=0.01)
-    assert posterior.shear_strength(pressure).std < 1e-6 * expected
-
-
 def joint(seed: int) -> tuple[Gaussian, np.ndarray]:
     """A joint Gaussian of the soil and four gains, the second held, and the prior sd of the gains."""
     rng = np.random.default_rng(seed)

@@ -122,22 +122,6 @@ def test_directions_that_the_data_leave_open_stay_at_the_prior(simulated):
     assert np.abs(away).max() < 2.0
 
 
-def test_held_parameters_keep_their_values_exactly(wet_clay):
-    values = dict(zip(PARAMETERS, wet_clay.soil, strict=True))
-    held = {name: (v, 0.0 if name in ("c", "K", "k_c") else v) for name, v in values.items()}
-    fit = fit_window(wet_clay.problem(), SoilPrior.from_value_std(held))
-    soil = fit.posterior.soil
-    assert (soil.c, soil.K, soil.k_c) == (values["c"], values["K"], values["k_c"])
-    covariance = fit.posterior.log_covariance
-    for name in ("c", "K", "k_c"):
-        assert not covariance[PARAMETERS.index(name)].any()
-        assert not covariance[:, PARAMETERS.index(name)].any()
-    assert np.abs(deviations(fit, wet_clay.soil)).max() < 3.0
-    everything = fit_window(wet_clay.problem(), SoilPrior.from_value_std({n: (v, 0.0) for n, v in values.items()}))
-    assert everything.posterior.soil == wet_clay.soil
-    assert everything.converged
-
-
 def test_a_cohesionless_soil_is_fitted_with_c_held_at_zero(simulated):
     sand = SOILS["dry_sand"]._replace(c=0.0, k_c=2e3)
     case = simulated(sand, 70, ["soil.c.value=0", "soil.c.std=0"])

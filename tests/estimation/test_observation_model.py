@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from soilbus.estimation.linearisation import Latents
-from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
+from soilbus.estimation.measurements import differentiated_speed
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel, inverse_covariance
 from soilbus.estimation.standing import STANDING, wheel_inertia
@@ -137,19 +137,6 @@ def test_gradients_are_those_of_the_least_sum_of_squares(few):
         assert gradient[7:] @ way == pytest.approx(numeric, rel=2e-3)
 
 
-def test_missing_rows_are_zero_and_everything_is_finite(few):
-    _, _, problem, soil, gains = few
-    at = converged(problem, soil, gains)
-    assert np.isfinite(at.rows).all()
-    assert np.isfinite(at.weighed).all()
-    m = 9  # torques, balance, sinkages
-    rows = at.rows.reshape(4, m, -1)
-    assert not rows[1, 0].any()
-    assert not rows[2, 5:].any()
-    assert np.abs(rows).sum(axis=2)[0].all()
-    assert np.count_nonzero(at.rows.any(axis=1)) == problem.n_rows
-
-
 def test_covariance_of_residuals_equals_monte_carlo(simulated):
     # One true state, seen 4000 times through the sensors' noise.
     case = simulated(SOILS["loam"], 5)
@@ -205,17 +192,6 @@ def test_masks(simulated):
     assert problem.has_balance.sum() == 85 - 5 - 3 - 1 - 10
     assert problem.n_rows == problem.has_balance.sum() + 2 * (4 * 85 - 9)
     assert np.isfinite(problem.linearise(case.soil, np.zeros(len(problem.gain_std)), problem.start(case.soil)).chi2)
-
-
-def test_gains_are_named_in_the_order_of_their_columns(few):
-    _, rig, problem, _, _ = few
-    assert problem.gain_names == [
-        *(f"{q}.{w}" for q in GAIN_QUANTITIES[:3] for w in rig.wheels),
-        "ground_speed",
-        "draft",
-        *STANDING,
-    ]
-    assert problem.gain_std[:14] == pytest.approx([0.005] * 8 + [0.0015] * 4 + [0.002, 0.005])
 
 
 def test_acceleration_from_speed_and_its_variance():

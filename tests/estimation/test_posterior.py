@@ -13,7 +13,6 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
 LOAM = SOILS["loam"]
-VALUES = dict(zip(PARAMETERS, LOAM, strict=True))
 
 
 def correlated(size: float, seed: int = 0) -> np.ndarray:
@@ -37,24 +36,6 @@ def test_prior_is_log_normal_with_that_median_and_coefficient_of_variation(value
     assert np.median(sample) == pytest.approx(value, rel=0.01)
     assert sample.std() / sample.mean() == pytest.approx(share, rel=0.05)
     assert prior.free.tolist() == list(range(6))
-
-
-def test_a_parameter_with_std_zero_is_held():
-    given_ = {name: (v, 0.0 if name in ("c", "K") else 0.3 * v) for name, v in VALUES.items()} | {"c": (0.0, 0.0)}
-    prior = SoilPrior.from_value_std(given_)
-    assert prior.free.tolist() == [0, 1, 2, 3]
-    assert prior.log_std[4:].tolist() == [0.0, 0.0]
-    assert prior.median[4] == 0.0
-
-
-def test_parameters_have_the_std_of_a_log_normal():
-    posterior = Posterior(LOAM, np.diag([0.1, 0.2, 0.05, 0.02, 0.0, 0.3]) ** 2)
-    estimates = posterior.parameters()
-    assert list(estimates) == list(PARAMETERS)
-    assert estimates["k_phi"].value == LOAM.k_phi
-    assert estimates["k_phi"].std == pytest.approx(0.2 * LOAM.k_phi, rel=0.04)  # test_gaussian has the exact one
-    assert estimates["n"].std == pytest.approx(0.05 * LOAM.n, rel=0.003)
-    assert estimates["c"].std == 0.0
 
 
 def test_what_is_open_has_a_std_that_is_a_number():
@@ -106,14 +87,6 @@ def test_a_scalar_has_the_std_by_its_gradient():
 def test_a_variance_below_zero_by_rounding_is_zero():
     covariance = np.diag([1e-4, -1e-20, 0.0, 0.0, 0.0, 0.0])
     assert Posterior(LOAM, covariance).propagate(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])) == 0.0
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_derived_quantities_have_the_sd_of_monte_carlo(seed):
-    posterior = Posterior(SOILS[("loam", "wet_clay", "lete_sand")[seed]], correlated(0.03, seed))
-    sample = Soil(*draws(posterior, 200_000).T)
-    pressure = (sample.k_c / 0.3 + sample.k_phi) * 0.02**sample.n
-    assert posterior.bearing_pressure(0.02, 0.3).std == pytest.approx(pressure.std(), rel=0.03)
 
 
 def test_an_added_covariance_adds_up_and_never_exceeds_the_prior():

@@ -54,19 +54,6 @@ def test_shares_are_those_of_forces_at_measured_loads_and_slips(predicting, simu
         assert shares[channel].size == pytest.approx(size, rel=0.02), channel
 
 
-def test_the_true_soil_predicts_within_a_few_per_cent_and_another_does_not(simulated):
-    case = simulated(SOILS["loam"], 3)
-    problem, found = case.problem(), {}
-    for name in ("loam", "wet_clay"):
-        soil, watch = SOILS[name], PredictionWatch(10.0)
-        latents = problem.with_entry_angles(problem.start(soil), soil)
-        at = problem.linearise(soil, np.zeros(len(problem.gain_std)), latents)
-        watch.take(10.0, prediction_shares(problem, at, SINCE, 1.0))
-        found[name] = watch.error()
-    assert found["loam"] < 0.05
-    assert found["wet_clay"] > 0.25
-
-
 def test_nothing_new_is_no_prediction(simulated):
     case = simulated(SOILS["loam"], 3)
     problem = case.problem()

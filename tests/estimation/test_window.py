@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
@@ -119,18 +119,6 @@ def test_every_sample_is_in_exactly_one_of_disjoint_windows(seed, origin, on_bor
         assert not share[counts == 0].any()
 
 
-@settings(max_examples=40)
-@given(seed=SEED, pieces=st.integers(1, 9))
-def test_order_and_batches_of_samples_do_not_matter(seed, pieces):
-    rng = np.random.default_rng(seed)
-    columns = {n: (np.sort(rng.uniform(0.0, 4.0, 150)), rng.normal(size=150)) for n in RIG.channels}
-    tidy = filled(columns).window(1.0, 3.0)
-    messy = filled(columns, 0.0, pieces, rng).window(1.0, 3.0)
-    for name in RIG.channels:
-        for a, b in zip(channel(tidy, name), channel(messy, name), strict=True):
-            assert a == pytest.approx(b, rel=1e-9, abs=1e-9, nan_ok=True)
-
-
 def test_drop_before_forgets_whole_bins_only_and_later_windows_stay_the_same():
     rng = np.random.default_rng(5)
     columns = {n: (np.sort(rng.uniform(0.0, 6.0, 400)), rng.normal(size=400)) for n in RIG.channels}
@@ -161,13 +149,6 @@ def test_a_window_beyond_the_data_is_all_missing():
         assert not np.isfinite(variance).any()
 
 
-def test_adding_nothing_changes_nothing():
-    store = filled({"draft": (np.array([0.05]), np.array([7.0]))})
-    store.add({})
-    store.add({"draft": (np.zeros(0), np.zeros(0)), "load.L": (np.zeros(0), np.zeros(0))})
-    assert store.window(0.0, 1.0).samples == 1
-
-
 def test_a_window_of_samples_counts_each_row_as_one():
     t = np.arange(5.0)
     samples = {"load.L": np.array([1e3, 2e3, np.nan, 4e3, 5e3]), "draft": np.full(5, 300.0), "unknown": t}
@@ -179,13 +160,3 @@ def test_a_window_of_samples_counts_each_row_as_one():
     assert np.isnan(window.torque).all()
     only = window_of_samples(RIG, t, samples, names=("draft",))
     assert np.isnan(only.load).all()
-
-
-def test_rows_picks_bins_of_every_column():
-    rng = np.random.default_rng(8)
-    window = filled({n: (rng.uniform(0, 2, 200), rng.normal(size=200)) for n in RIG.channels}).window(0.0, 2.0)
-    part = window.rows(np.array([3, 5]))
-    assert part.t == pytest.approx(window.t[[3, 5]])
-    for name in RIG.channels:
-        for a, b in zip(channel(part, name), channel(window, name), strict=True):
-            assert np.array_equal(a, b[[3, 5]], equal_nan=True)

@@ -1,4 +1,4 @@
-"""Reversing is driving forward seen in a mirror; turns are recognised by their rim speeds."""
+"""Reversing is driving forward seen in a mirror."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.estimation.assembly import model_of
 from soilbus.estimation.local_cubics import curve_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
+from soilbus.estimation.window import Window, forward
 from soilbus.terra.soils import SOILS
 
 ALONG = ("speed", "torque", "ground_speed", "draft", "pitch", "acceleration")
 ACROSS = ("load", "sinkage")
-MAX_TURN = 0.15
 
 
 def backwards(window: Window, part=slice(None), signed_ground: bool = True) -> Window:
@@ -73,14 +70,6 @@ def test_curves_of_samples_are_mirrored_and_kept_where_the_vehicle_stood(loam):
         assert np.array_equal(found[name].slope, sign * curve.slope), name
 
 
-def test_slopes_and_draft_point_the_other_way_in_reverse(loam):
-    # Backing down a slope with the implement pushing is, in the mirror, driving down it nose first.
-    reverse = backwards(loam.window)
-    wrong = dataclasses.replace(forward(reverse), pitch=reverse.pitch)
-    fit = fit_window(loam.problem(wrong), loam.prior)
-    assert fit is None or fit.chi2 > 2.0
-
-
 def few(speeds, **columns) -> Window:
     """Instants with these wheel speeds (N, 4); everything else is 1."""
     speed = np.array(speeds, float)
@@ -117,57 +106,3 @@ def test_ground_speed_keeps_its_sign_where_the_wheels_drive_forward():
     # Rolling back downhill while the wheels spin forward is no slip of this model; the standstill gate has it.
     mirrored = forward(few([[1, 1, 1, 1], [-1, -1, -1, -1]], ground_speed=[-0.5, -0.5]))
     assert mirrored.ground_speed.tolist() == [-0.5, 0.5]
-
-
-# --- turns ---
-
-
-def rig(front, radius=None) -> Rig:
-    n = len(front)
-    noise = {q: SensorNoise(absolute=1.0) for q in ALONG + ACROSS}
-    radii = np.array(radius or [0.5] * n)
-    return Rig(tuple("ABCDEF"[:n]), radii, np.full(n, 0.3), np.array(front), None, noise)
-
-
-TRACTOR = rig([True, True, False, False], [0.5, 0.5, 0.62, 0.62])
-
-
-def on_a_curve(radius_of_turn: float, track: float = 1.5, slip: float = 0.2) -> Window:
-    """One instant of a left turn at 1.4 m/s, every wheel with the same slip."""
-    side = np.array([-1.0, 1.0, -1.0, 1.0])
-    path = 1.4 * (1.0 + side * track / (2.0 * radius_of_turn))
-    return few([path / (TRACTOR.radius * (1.0 - slip))], ground_speed=[1.4])
-
-
-@pytest.mark.parametrize("slip", [0.05, 0.5])
-@pytest.mark.parametrize("to", [1.0, -1.0], ids=["left", "right"])
-def test_sharp_turns_are_turns_and_curves_are_not(slip, to):
-    # 15 % of the mean at a track of 1.5 m: a radius of 10 m, whatever the slip.
-    for radius, expected in ((3.0, True), (9.8, True), (10.2, False), (30.0, False), (1e9, False)):
-        assert turning(on_a_curve(to * radius, slip=slip), TRACTOR, MAX_TURN).tolist() == [expected]
-
-
-def test_every_axle_must_turn():
-    straight = few([[2.0, 2.4, 2.0, 2.0], [2.0, 2.4, 2.0, 2.4], [2.0, 2.0, 2.0, 2.4]])
-    assert turning(straight, TRACTOR, MAX_TURN).tolist() == [False, True, False]
-
-
-def test_an_unknown_axle_does_not_count():
-    nan = np.nan
-    window = few([[2.0, 2.4, nan, 2.4], [nan, 2.4, 2.0, nan], [nan] * 4, [2.0, nan, 2.0, 2.0], [0.0] * 4])
-    assert turning(window, TRACTOR, MAX_TURN).tolist() == [True, False, False, False, False]
-
-
-def test_a_sharp_turn_does_harm_and_is_left_out(simulated):
-    off = []
-    side = np.array([1.0, -1.0, 1.0, -1.0])
-    for seed in range(4):
-        case = simulated(SOILS["loam"], seed)
-        bent = dataclasses.replace(case.window, speed=case.window.speed * (1.0 + 0.1 * side))  # 7.5 m: a headland
-        assert turning(bent, case.rig, MAX_TURN).mean() > 0.95
-        model = model_of(case.config)
-        gated = ObservationModel(bent, case.rig, model, 0.2, MAX_TURN)
-        assert gated.turning == turning(bent, case.rig, MAX_TURN).sum() == len(bent.t) - gated.n
-        tan_phi = fit_window(ObservationModel(bent, case.rig, model, 0.2, np.inf), case.prior).posterior.tan_phi()
-        off.append((tan_phi.value - np.tan(case.soil.phi)) / tan_phi.std)
-    assert np.sqrt(np.mean(np.square(off))) > 5.0

@@ -72,6 +72,22 @@ def test_turns_are_found_with_and_without_a_yaw_rate(to, radius, speed, slip, st
     assert turning(drive(rims, speed), rig(), MAX_TURN).tolist() == [True]
 
 
+@pytest.mark.parametrize("to", [1.0, -1.0], ids=["left", "right"])
+def test_a_turn_begins_at_its_share_of_the_mean_rim_speed_whatever_the_slip(to):
+    for slip in (0.05, 0.5):
+        for share, expected in ((2.0, True), (1.02, True), (0.98, False), (0.3, False), (1e-9, False)):
+            rims, _ = on_a_curve(to * TRACK / MAX_TURN / share, 1.4, np.full(4, slip))
+            assert turning(drive(rims, 1.4), rig(), MAX_TURN).tolist() == [expected]
+
+
+def test_every_known_axle_must_turn():
+    nan = np.nan
+    straight = drive([[2.0, 2.4, 2.0, 2.0], [2.0, 2.4, 2.0, 2.4], [2.0, 2.0, 2.0, 2.4]], 1.4)
+    assert turning(straight, rig(), MAX_TURN).tolist() == [False, True, False]
+    gaps = drive([[2.0, 2.4, nan, 2.4], [nan, 2.4, 2.0, nan], [nan] * 4, [2.0, nan, 2.0, 2.0], [0.0] * 4], 1.4)
+    assert turning(gaps, rig(), MAX_TURN).tolist() == [True, False, False, False, False]
+
+
 @given(speed=st.floats(0.2, 3.0), low=st.tuples(slips, slips), more=st.tuples(st.floats(0.1, 5.0), st.floats(0.1, 5.0)))
 def test_wheels_that_spin_crosswise_are_no_turn(speed, low, more):
     # diagonal spin of open differentials: front left and rear right, or the other way round

@@ -12,14 +12,14 @@ import pytest
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.decision.traversability import Status, Traversability
-from soilbus.estimation.posterior import Estimate
+from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.replay import replay
 from soilbus.pipeline.determination import Excitation
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.configuration import configuration_warnings
 from soilbus.report.page import Source
-from soilbus.report.replay import next_steps
+from soilbus.report.replay import headline, next_steps
 from soilbus.report.windows import summary, summary_of, why_of_no_use
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
@@ -98,6 +98,20 @@ def test_each_reason_has_its_advice(reason, says):
     for text_ in (text, line):
         assert "nan" not in text_
         assert "None" not in text_
+
+
+@pytest.mark.parametrize(
+    ("valid", "said"),
+    [
+        (0, "The soil is known in none of 3 windows, doubtful in 3; 3 are degraded: not_excited"),
+        (2, "The soil is known in 2 of 5 windows"),
+    ],
+)
+def test_where_nothing_decides_the_page_says_first_in_how_many_windows_the_soil_is_known(valid, said):
+    loam = Posterior(SOILS["loam"], 0.1 * np.eye(6))
+    doubtful, good = window("not_excited", Status.DEGRADED), window("none", Status.VALID)
+    results = [replace(each, posterior=loam) for each in [doubtful] * 3 + [good] * valid]
+    assert headline(results, reference_configuration()) == said
 
 
 def test_a_draft_about_zero_has_no_share():

@@ -20,7 +20,6 @@ from soilbus.terra.wheel import (
     Soil,
     WheelModel,
     WheelState,
-    sinkage,
     state_on,
     wheel_forces,
     wheel_forces_and_derivatives,
@@ -108,17 +107,6 @@ def test_forces_equal_adaptive_integration_in_every_corner(state, law):
     exact, fast = error(state, model, EXACT_NODES), error(state, model, FAST_NODES)
     assert np.all(exact < 1e-6)
     assert np.all(fast < 5e-5)
-
-
-def test_the_papers_wet_clay_at_five_centimetres():
-    # shared/paper/notes.md: r = 0.5 m, b = 0.3 m, slip 0.2, c1 = 0.5
-    angle = math.acos(1.0 - 0.05 / R)
-    state = state_on(SOILS["xi_wet_clay"], angle, 0.2, R, B)
-    assert sinkage(angle, R) == pytest.approx(0.05, rel=1e-12)
-    _, DP, T = wheel_forces(state, WheelModel())
-    assert (round(DP), round(T)) == (192, 278)
-    _, DP, T = wheel_forces(state, WheelModel(shear_law="rational"))
-    assert (round(DP), round(T)) == (77, 219)
 
 
 def central(state: WheelState, model: WheelModel, name: str, step: float) -> np.ndarray:

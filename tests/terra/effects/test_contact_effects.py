@@ -54,16 +54,6 @@ def test_an_effect_on_the_stress_is_the_integral_with_other_angles(state, name, 
 
 
 @EACH_WHEEL
-def test_a_rut_that_recovers_carries_behind_the_axle(state):
-    true = adaptive_forces(state, WheelModel("rational", exit_ratio=-0.35))
-    ours = with_effect("rut_recovery", state, recovery=0.35)
-    same(ours, true)
-    plain = wheel_forces(state, MODEL)
-    assert ours[0] > plain[0]
-    assert ours[1] / ours[0] > plain[1] / plain[0]  # it pushes
-
-
-@EACH_WHEEL
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_a_share_of_the_exponential_law(state, share):
     true = adaptive_forces(state, MODEL, mobilised=lambda x: share * exponential(x) + (1.0 - share) * rational(x))
