@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.instants import averaged
 from soilbus.estimation.linearisation import Latents
 from soilbus.estimation.measurements import differentiated_speed
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel, inverse_covariance
 from soilbus.estimation.standing import STANDING, wheel_inertia
 from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY
@@ -238,3 +243,23 @@ def test_a_fit_behind_an_open_differential_converges_where_loads_shake(seed):
     assert fit.converged
     pressure, true = fit.mode.posterior.bearing_pressure(0.1, 0.3), SOILS["loam"].bearing_pressure(0.1, 0.3)
     assert abs(np.log(pressure.value / true)) < 2.5 * pressure.std / pressure.value
+
+
+def test_a_mean_over_swinging_slips_is_one_of_the_forces() -> None:
+    rig, soil = rig_of(reference_configuration()), SOILS["loam"]
+    t = np.arange(0.05, 10.0, 0.1)
+    load, ground = np.tile([5e3, 5e3, 6e3, 6e3], (len(t), 1)), np.full(len(t), 1.2)
+    slip = 0.2 + np.outer(np.sin(2.0 * np.pi * 2.0 * t), [0.02, 0.05, 0.1, 0.1])
+    speed = ground[:, None] / (rig.radius * (1.0 - slip))
+    pull, torque, _ = explicit(rig, soil, load, speed, ground)
+    samples = {"ground_speed": ground, "draft": pull, "pitch": 0.0 * t, "acceleration": 0.0 * t}
+    for quantity, values in (("load", load), ("speed", speed), ("torque", torque)):
+        samples |= {f"{quantity}.{wheel}": values[:, i] for i, wheel in enumerate(rig.wheels)}
+    window = averaged(window_of_samples(rig, t, samples), 10.0, 0.5)
+
+    def off(window: Window) -> np.ndarray:
+        problem = ObservationModel(window, rig, MODEL, 0.1)
+        at = problem.linearise(soil, np.zeros(len(problem.gain_names)), problem.start(soil))
+        return np.abs(at.rows[:, 0].reshape(problem.n, -1).mean(axis=0))[[2, 3, 4]]  # torques behind, balance
+
+    assert (off(window) < 0.25 * off(replace(window, swing=0.0 * window.swing))).all()

@@ -53,6 +53,7 @@ def averaged(window: Window, end: float, length: float) -> Window:
     value, variance = (dict(zip(_QUANTITIES, part, strict=False)) for part in means)
     with np.errstate(divide="ignore"):
         value["speed"] = 1.0 / _means([1.0 / window.speed], starts, 1)[0]
+    swing = _swing(window, starts)
     if given is not None:
         (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
         given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)
@@ -62,10 +63,22 @@ def averaged(window: Window, end: float, length: float) -> Window:
         t=np.add.reduceat(window.t - end, starts) / each + end,
         variance=variance,
         observations=given,
+        swing=swing,
         direction=np.sign(np.add.reduceat(window.direction, starts)),
         curves={name: curve.averaged(length, int(np.median(each))) for name, curve in window.curves.items()},
         **value,  # type: ignore[arg-type]
     )
+
+
+def _swing(window: Window, starts: NDArray[np.intp]) -> Array:
+    """Relative sd (N, W) of V / omega within the instants that begin at starts (N,), beyond the noise of bins."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(window.ground_speed[:, None] / window.speed)
+        noise = window.variance["ground_speed"] / window.ground_speed**2
+        variance = ratio**2 * (noise[:, None] + window.variance["speed"] / window.speed**2)
+        mean, square, of_noise = _means([ratio, ratio**2, variance], starts, 1)
+        swing = np.sqrt(np.maximum(square - mean**2 - of_noise, 0.0)) / mean
+    return np.asarray(np.where(np.isfinite(swing), np.minimum(swing, 0.5), 0.0))
 
 
 def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:

@@ -45,7 +45,7 @@ MASS_GAIN = "load.weight"
 
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "speed",
-    "ground_speed", "slip", "draft", "draft_var", "demand_var",
+    "ground_speed", "slip", "swing", "draft", "draft_var", "demand_var",
     "inertia", "inertia_var", "draft_noise", "has_balance", "pitch", "since", "distance", "wheel_angle",
     "acceleration", "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "known",
@@ -86,7 +86,7 @@ class Measurements:
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
         self.turning = int(np.count_nonzero(moving & in_turn))
-        self.t = window.t[kept]
+        self.t, self.swing = window.t[kept], window.swing[kept]
         self.usable = usable = usable[kept]
 
         def masked(value: Array, variance: Array) -> Masked:

@@ -90,7 +90,7 @@ class ObservationModel(Measurements):
         layout = self.layout if by_sensors else Layout.of(self.n_wheels, 0)
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
         self.work.instants += self.n
-        at = self._response(soil, gains, latents)
+        at = self._mean_response(soil, gains, latents)
         rolling_slip = self._rolling_slip(at, latents)
         if self.rolls.any():
             at = at.rolling(self.rolls)
@@ -256,6 +256,16 @@ class ObservationModel(Measurements):
         step = np.where(by_slip > 0.0, -torque / np.where(by_slip > 0.0, by_slip, 1.0), -limit)
         most = self.options.measurements.max_rolling_skid
         return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
+
+    def _mean_response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
+        """Mean of the responses at one sd of each wheel's V / omega above and below its mean in an instant."""
+        if not self.swing.any():
+            return self._response(soil, gains, latents)
+        two = list[Response]()
+        for ratio in (1.0 + self.swing, 1.0 - self.swing):
+            at = self._response(soil, gains, latents._replace(speed=latents.speed / ratio))
+            two.append(at._replace(by_speed=at.by_speed / ratio))
+        return Response(*[0.5 * (one + other) for one, other in zip(*two, strict=True)])
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""

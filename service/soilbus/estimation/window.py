@@ -153,9 +153,13 @@ class Window:
     # (N,), -1 where the vehicle reversed before `forward`, else 1
     direction: Array = field(default_factory=lambda: np.empty(0))
     observations: Observations | None = None  # of `instrumentation.completed`
+    # (N, W) relative sd of V / omega within an instant, of `instants.averaged`
+    swing: Array = field(default_factory=lambda: np.empty((0, 0)))
     kinematic: bool = False  # whether an acceleration that was a specific force has become dv/dt
 
     def __post_init__(self) -> None:
+        if len(self.swing) != len(self.t):
+            object.__setattr__(self, "swing", np.zeros(self.speed.shape))
         for quantity in ("yaw_rate", "roll", "steering_angle", "differential_lock", "direction"):
             if len(getattr(self, quantity)) != len(self.t):
                 object.__setattr__(self, quantity, np.full(len(self.t), 1.0 if quantity == "direction" else np.nan))
@@ -169,6 +173,7 @@ class Window:
             t=self.t[keep],
             variance={q: v[keep] for q, v in self.variance.items()},
             direction=self.direction[keep],
+            swing=self.swing[keep],
             observations=given and type(given)(*[column[keep] for column in given]),
             **values,
         )
