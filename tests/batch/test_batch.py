@@ -287,6 +287,13 @@ def test_a_manifest_names_vehicle_start_and_configuration(client, config, logs, 
     assert set(windows.loc["T3"].day.astype(str)) == {"unknown"}
 
 
+def test_logs_come_by_glob_url_and_parquet_manifest(config, logs, tmp_path):
+    pd.DataFrame({"log": [str(logs / "red/morning.log")], "vehicle": ["x"]}).to_parquet(tmp_path / "m.parquet")
+    names = [str(logs / "r*" / "*.log"), f"file://{logs}/blue/w*.log", str(tmp_path / "m.parquet")]
+    found = [(job.vehicle, Path(job.log).name) for job in jobs_of(config, "t", names, no_other)]
+    assert found == [("blue", "whole.log"), ("red", "midnight.log"), ("red", "morning.log"), ("x", "morning.log")]
+
+
 def test_a_configuration_that_fits_no_log_is_one_line(client, config, logs, tmp_path):
     own = jobs_of(config, "mine.toml", [str(logs / "blue/other.log")], no_other)
     with pytest.raises(ConfigError) as fault:

@@ -74,6 +74,16 @@ def test_ends_of_the_range_are_values_and_beyond_is_an_error():
     assert slip(-1e300) == "error"
 
 
+def test_standard_deviations_stay_at_the_top_but_never_go_below():
+    publisher = Publisher(DATABASE)
+
+    def std(x):
+        return decoded(publisher.frame("SoilStrength", {"BearingPressureStd": x}))["BearingPressureStd"]
+
+    assert std(1e9) == 3212.0
+    assert std(-1.0) == "error"
+
+
 @pytest.mark.parametrize("message", [m.name for m in DATABASE.messages])
 def test_counter_goes_up_by_one_in_each_message_alone(message):
     publisher = Publisher(DATABASE)

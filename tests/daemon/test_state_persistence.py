@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import Counter
 from concurrent.futures import Executor
@@ -190,3 +191,11 @@ def first_verdict(wire: ScriptedBus) -> float:
         t for t, m in wire.sent if m.arbitration_id == message.frame_id and message.decode(m.data)["State"] != "unknown"
     ]
     return known[0] - wire.sent[0][0]
+
+
+def test_the_file_can_be_read_by_people(tmp_path: Path):
+    persistence_in(tmp_path, FakeClock()).close(BELIEF, {"windows": 3})
+    state = json.loads((tmp_path / "state.json").read_text())["state"]
+    assert list(state["gaussian"]["soil"]) == ["k_c", "k_phi", "n", "phi", "c", "K"]
+    assert state["gaussian"]["gains"]["torque.FL"] == 0.0
+    assert state["totals"] == {"windows": 3}

@@ -342,14 +342,14 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
         rng = np.random.default_rng([seed, 7])
         of_c, of_K, of_mass, of_cg = rng.standard_normal(4).tolist()
         config = configured(
-            tmp_path, MACHINES[machine][0], *CLOSED, "estimator.hop=10.0",
+            tmp_path, MACHINES[machine][0], *CLOSED, "estimator.hop=5.0",
             f"vehicle.mass={{value={2300.0 + 46.0 * of_mass}, std=46.0}}",
             f"vehicle.cg_ahead_of_rear_axle={{value={0.95 + 0.039 * of_cg}, std=0.039}}",
             f"soil.c={{value={ground.c * (1.0 + 0.25 * of_c)}, std={0.25 * ground.c}}}",
             f"soil.K={{value={ground.K * (1.0 + 0.25 * of_K)}, std={0.25 * ground.K}}}",
         )  # fmt: skip
         drive = shaking.drive(seed, ground, duration=31.0, shake=4.0)
-        for result in estimated(config, drive):
+        for result in estimated(config, drive)[::2]:
             assert result.posterior is not None
             tan_phi, pressure = result.posterior.tan_phi(), result.bearing
             off.append((tan_phi.value - np.tan(ground.phi)) / tan_phi.std)

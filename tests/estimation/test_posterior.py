@@ -13,6 +13,7 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
 LOAM = SOILS["loam"]
+VALUES = dict(zip(PARAMETERS, LOAM, strict=True))
 
 
 def correlated(size: float, seed: int = 0) -> np.ndarray:
@@ -36,6 +37,14 @@ def test_prior_is_log_normal_with_that_median_and_coefficient_of_variation(value
     assert np.median(sample) == pytest.approx(value, rel=0.01)
     assert sample.std() / sample.mean() == pytest.approx(share, rel=0.05)
     assert prior.free.tolist() == list(range(6))
+
+
+def test_a_parameter_with_std_zero_is_held():
+    given_ = {name: (v, 0.0 if name in ("c", "K") else 0.3 * v) for name, v in VALUES.items()} | {"c": (0.0, 0.0)}
+    prior = SoilPrior.from_value_std(given_)
+    assert prior.free.tolist() == [0, 1, 2, 3]
+    assert prior.log_std[4:].tolist() == [0.0, 0.0]
+    assert prior.median[4] == 0.0
 
 
 def test_what_is_open_has_a_std_that_is_a_number():

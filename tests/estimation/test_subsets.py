@@ -66,22 +66,61 @@ def test_nothing_free_is_the_prior(clay):
     assert posterior.bearing_pressure(0.02, 0.3).std == posterior.tan_phi().std == 0.0
 
 
+WIDTHS = {"unlike": (0.20, 0.50), "alike": (0.35, 0.35)}
 PRIOR = 0.5
 """Sd of the logarithm of k_c; of the others it is wide."""
 
 
-def test_two_tyre_widths_separate_k_c_from_k_phi(simulated):
-    """Eight drives with tyres of 20 cm in front and 50 cm behind."""
+@pytest.fixture(scope="module")
+def fits(simulated):
+    """Eight drives each with unlike and with equal tyre widths in front and behind."""
     spread = np.array([PRIOR, 1.0, 0.5, 0.4, 0.25, 0.25])
-    widths = [f"wheel.{name}.width={width}" for name, width in (("FL", 0.2), ("FR", 0.2), ("RL", 0.5), ("RR", 0.5))]
-    away = []
-    for seed in range(8):
-        median = TRUTH * np.exp(spread * np.random.default_rng([400 + seed, 5]).standard_normal(6))
-        problem = simulated(CLAY, 400 + seed, widths).problem()
-        posterior = fit_window(problem, SoilPrior(median, spread)).posterior
-        std = np.sqrt(np.diag(posterior.log_covariance))
-        assert std[0] < 0.12 * PRIOR
-        away.append(np.log(np.asarray(posterior.soil) / TRUTH) / std)
-    for z in np.transpose(away)[[PARAMETERS.index("k_c"), PARAMETERS.index("k_phi")]]:
+
+    def fit(widths, seed):
+        wheels = {"FL": 0, "FR": 0, "RL": 1, "RR": 1}
+        settings = [f"wheel.{name}.width={widths[axle]}" for name, axle in wheels.items()]
+        prior_median = TRUTH * np.exp(spread * np.random.default_rng([seed, 5]).standard_normal(6))
+        problem = simulated(CLAY, seed, settings).problem()
+        return prior_median, fit_window(problem, SoilPrior(prior_median, spread)).posterior
+
+    return {which: [fit(widths, 400 + seed) for seed in range(8)] for which, widths in WIDTHS.items()}
+
+
+def deviations(posteriors, name):
+    """Error of the logarithm in its own standard deviations."""
+    i = PARAMETERS.index(name)
+    return np.array([
+        np.log(p.soil[i] / TRUTH[i]) / np.sqrt(p.log_covariance[i, i]) for p in posteriors
+    ])  # fmt: skip
+
+
+def test_two_tyre_widths_separate_k_c_from_k_phi(fits):
+    unlike = [posterior for _, posterior in fits["unlike"]]
+    assert max(np.sqrt(p.log_covariance[0, 0]) for p in unlike) < 0.12 * PRIOR
+    for name in ("k_c", "k_phi"):
+        z = deviations(unlike, name)
         assert np.abs(z).max() < 3.5
         assert 0.86 < (z**2).sum() < 26.2  # chi-square with 8 degrees of freedom: 99.8 %
+
+
+def known_before(prior_median, K_L, width):
+    """Mean and std of log k_c by the prior alone, where k_c / width + k_phi is K_L."""
+    k_c = width * K_L * np.linspace(0.0, 1.0, 20_002)[1:-1]
+    k_phi = K_L - k_c / width
+    off = np.log(np.stack([k_c, k_phi])) - np.log(prior_median[:2])[:, None]
+    weight = np.exp(-0.5 * ((off[0] / PRIOR) ** 2 + off[1] ** 2)) / (k_c * k_phi)  # uniform in k_c
+    mean = np.average(np.log(k_c), weights=weight)
+    return mean, np.sqrt(np.average((np.log(k_c) - mean) ** 2, weights=weight))
+
+
+def test_equal_widths_leave_k_c_at_its_prior(fits):
+    # With its own part in K_L, which is known: the share of k_phi has a prior too, if a wide one.
+    for prior_median, posterior in fits["alike"]:
+        mean, std = known_before(prior_median, posterior.soil.k_phi + posterior.soil.k_c / 0.35, 0.35)
+        assert np.sqrt(posterior.log_covariance[0, 0]) == pytest.approx(std, rel=0.08)
+        assert std > 0.9 * PRIOR
+        assert np.log(posterior.soil.k_c) == pytest.approx(mean, abs=0.25 * PRIOR)  # the mode, not the mean
+        # What the tyres do tell is the pressure under themselves.
+        own, narrow = (posterior.bearing_pressure(0.1, width) for width in (0.35, 0.10))
+        assert own.std / own.value < 0.03
+        assert narrow.std / narrow.value > 0.1

@@ -14,7 +14,7 @@ from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.trials.draft_trials import true_largest_draft
 
-CONFIG = reference_configuration(["estimator.hop=2.0"])
+CONFIG = reference_configuration()
 STEADY = {"speed": Profile([0, 90], [1.4, 1.4])}
 
 
@@ -41,10 +41,10 @@ def test_constant_draft_after_a_border_leaves_no_gap(scenario, seed):
         assert result.posterior is not None
         assert result.traversability.max_draft is not None or result.reason == "not_excited new_soil"
         assert result.traversability.state is not State.GO or result.status is Status.VALID
-    assert sum(result.traversability.max_draft is None for result in results) <= 2  # the border
+    assert sum(result.traversability.max_draft is None for result in results) <= 4  # the border
     rig, largest = rig_of(CONFIG), CONFIG.traversability.max_slip
     truth = true_largest_draft(clay, rig, np.full(len(rig.wheels), np.inf), largest, model_of(CONFIG))
-    for result in results[-5:]:  # the pressure at 2 cm slides along n, which nothing excites; the draft does not
+    for result in results[-10:]:  # the pressure at 2 cm slides along n, which nothing excites; the draft does not
         assert result.reason.split()[0] in ("none", "not_excited")
         most = result.traversability.max_draft
         assert abs(most.value - truth) < 3.0 * most.std

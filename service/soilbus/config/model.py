@@ -663,9 +663,9 @@ class Estimator(_Section):
     soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
-    """Samples are averaged over bins of this length [s].  The watch follows bins, the fit averages them over 0.25 s.
-    By default 0.04 s where wheels share a torque behind an open or limited differential: there slip changes with the
-    load at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque."""
+    """Samples are averaged over bins of this length [s].  The watch follows bins, the fit averages them over 0.25 s, or
+    0.5 s where loads are computed.  By default 0.04 s where wheels share a torque behind an open or limited
+    differential: there slip changes with the load at 1.5 to 3 Hz, and torque at a mean slip is not the mean torque."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
