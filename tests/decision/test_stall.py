@@ -1,8 +1,4 @@
-"""Immobilisation ahead, without a soil: a point mass on wheels with inertia, by formulas of its own.
-
-m dV/dt = F(s) - R - m g sin(slope),    J domega/dt = T - r F(s),    F(s) = mu(s) W,   thrust falls beyond its peak
-R grows with the distance that wheels dig: dR/dt = k max(r omega - V, 0)
-"""
+"""Immobilisation ahead, without a soil: the trend's filter against least squares, and what it must not warn of."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ from soilbus.config.model import Traversability, Warning
 from soilbus.decision.moments import Sample
 from soilbus.decision.stall import LocalTrend, Stall, stalling
 
-G, STEP, LOOK = 9.81, 0.0005, 0.1
+LOOK = 0.1
 
 
 def warnings(samples: list[Sample], min_speed: float = 0.2) -> list[float]:

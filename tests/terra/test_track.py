@@ -177,8 +177,3 @@ def test_the_entry_angle_carries_the_load(load, slip, name, guess):
         assert float(sinkage(found, R)) < 2e-7
     else:
         assert float(sinkage(found, R)) == pytest.approx(z, rel=1e-6)
-
-
-# Two vehicles of equal weight and contact area, a wide short track beside a narrow long one: the comparison of Wong,
-# Theory of Ground Vehicles, ch. 2, as we remember its inputs (no public text has them).  Calculated by hand from the
-# closed formulas of Bekker, Janosi & Hanamoto and Wong that stand in the head of terra.track.
