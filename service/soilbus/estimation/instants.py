@@ -1,7 +1,7 @@
 """Instants: means of a window's bins over whole cycles of a machine that shakes.
 
     y_i = mean of the known y_b,    var y_i = sum of var y_b / n^2         n bins b of an instant i
-    omega_i = 1 / mean (1 / omega_b)                                       so that 1 - V / (r omega) is the mean slip
+    omega_i = V_i / mean (V_b / omega_b)                                   so that 1 - V / (r omega) is the mean slip
 
 A model of steady wheels holds in the mean of a cycle only.  Within one, loads, slips and torques also follow each other
 by relaxation, inertia and filters.  What these leave of a fit passes for curvature of torque over slip, and so for
@@ -51,9 +51,9 @@ def averaged(window: Window, end: float, length: float) -> Window:
         variances += [given.torque_var, given.variance]
     means = _means(values, starts, 1), _means(variances, starts, 2)
     value, variance = (dict(zip(_QUANTITIES, part, strict=False)) for part in means)
-    with np.errstate(divide="ignore"):
-        value["speed"] = 1.0 / _means([1.0 / window.speed], starts, 1)[0]
-    swing = _swing(window, starts)
+    ratio, swing = _ratios(window, starts)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value["speed"] = value["ground_speed"][:, None] / ratio
     if given is not None:
         (torque, latents, *follows), of_latents = means[0][len(value) :], means[1][len(variance) :]
         given = type(given)(torque, of_latents[0], latents, of_latents[1], *follows)
@@ -70,15 +70,15 @@ def averaged(window: Window, end: float, length: float) -> Window:
     )
 
 
-def _swing(window: Window, starts: NDArray[np.intp]) -> Array:
-    """Relative sd (N, W) of V / omega within the instants that begin at starts (N,), beyond the noise of bins."""
+def _ratios(window: Window, starts: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Mean of V / omega (N, W) in the instants that begin at starts (N,), and its relative sd beyond bins' noise."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(window.ground_speed[:, None] / window.speed)
+        ratio = window.ground_speed[:, None] / window.speed
         noise = window.variance["ground_speed"] / window.ground_speed**2
         variance = ratio**2 * (noise[:, None] + window.variance["speed"] / window.speed**2)
         mean, square, of_noise = _means([ratio, ratio**2, variance], starts, 1)
-        swing = np.sqrt(np.maximum(square - mean**2 - of_noise, 0.0)) / mean
-    return np.asarray(np.where(np.isfinite(swing), np.minimum(swing, 0.5), 0.0))
+        swing = np.sqrt(np.maximum(square - mean**2 - of_noise, 0.0)) / np.abs(mean)
+    return mean, np.where(np.isfinite(swing), np.minimum(swing, 0.5), 0.0)
 
 
 def _means(columns: list[Array], starts: NDArray[np.intp], power: int) -> list[Array]:
