@@ -21,7 +21,7 @@ def run(*arguments: str) -> tuple[subprocess.CompletedProcess[str], float, float
 
 
 def test_demo_ends_by_itself_in_time_and_turns_from_go_to_no_go():
-    """It takes the drive's time and the work of less than 5.5 starts, or 4.5 where bytecode is compiled at each."""
+    """It takes the drive's time and the work of less than 5.5 starts: 6 s where a start with bytecode takes 1.1 s."""
     _, _, start = run("-c", "import soilbus.cli.demo")
     done, taken, used = run("-m", "soilbus", "demo")
     _, _, again = run("-c", "import soilbus.cli.demo")
@@ -32,4 +32,4 @@ def test_demo_ends_by_itself_in_time_and_turns_from_go_to_no_go():
     assert decisions[0] == "GO"
     assert "NO-GO" in decisions[-4:]
     assert taken > DRIVE
-    assert used < (4.5 if sys.dont_write_bytecode else 5.5) * max(start, again)
+    assert used < 5.5 * max(start, again)

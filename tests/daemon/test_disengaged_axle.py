@@ -49,7 +49,7 @@ def with_a_shaft_to_both_axles(lead: float = 1.0):
 def largest_draft(truth, config, seed: int):
     """Of the last window of a drive on loam."""
     intake = Intake(config, load_databases(config))
-    for message in frames(simulate(truth, excited("loam", 12.5), seed), truth):
+    for message in frames(simulate(truth, excited("loam", 14.5), seed), truth):
         feed_message(intake.admission, message)
     intake.ingest()
     estimator = WindowEstimator(config)
@@ -125,12 +125,12 @@ def test_each_choice_of_axles_keeps_what_it_has_learned():
     trackers, drafts = [], []
     for part, truth in enumerate((config, TRUTH, config)):
         begin = 0.0
-        for message in frames(simulate(truth, excited("loam", 14.0), 5 + part), truth):
+        for message in frames(simulate(truth, excited("loam", 18.0), 5 + part), truth):
             begin = begin or message.timestamp
-            message.timestamp += 14.0 * part
+            message.timestamp += 18.0 * part
             feed_message(intake.admission, message)
         intake.ingest()
-        found = [estimator.solve(task) for task in intake.due(begin + 14.0 * (part + 1) - 0.2)]
+        found = [estimator.solve(task) for task in intake.due(begin + 18.0 * (part + 1) - 0.2)]
         trackers.append(estimator.tracker)
         drafts.append(found[-1].traversability.max_draft)
     assert trackers[0] is trackers[2] is not trackers[1]

@@ -81,3 +81,41 @@ def test_a_specific_force_shows_the_slope_within_two_seconds_and_no_acceleration
         found.append(state.slope)
     assert max(abs(s) for s in found[20:200]) < 0.15
     assert max(abs(s - 1.0) for s in found[220:]) < 0.15
+
+
+RUNS_AWAY = {"slips": (0.1, 0.7), "speed": 0.6}
+STANDS = {"slips": (0.3, 0.5), "speed": -0.6}
+
+
+def drive(slips=(0.1, 0.1), speed=1.2, thrusts=(0.3, 0.3), draft=0.2, moves_from=0.0) -> list[Sample]:
+    """Samples of 13 s: steady, then from 8 s on slip, speed [m/s], thrust and draft go evenly to these values."""
+    samples = []
+    for t in np.arange(0.0, 13.0, LOOK).tolist():
+        k = max(t - 8.0, 0.0) / 5.0
+        V, slip, thrust, pull = (a + k * (b - a) for a, b in ((1.2, speed), slips, thrusts, (0.2, draft)))
+        V = max(V, 0.0) if t >= moves_from else 0.0
+        samples.append(Sample(t, V, 0.01**2, V / (1.0 - slip), 0.01**2, thrust, draft=pull))
+    return samples
+
+
+@pytest.mark.parametrize("sign", [RUNS_AWAY, STANDS])
+def test_it_warns_where_slip_runs_away_and_where_the_vehicle_is_about_to_stand(sign):
+    (begun,) = warnings(drive(**sign))
+    assert 8.0 < begun < 12.0
+
+
+@pytest.mark.parametrize(
+    ("sign", "otherwise"),
+    [
+        (RUNS_AWAY, {"slips": (0.1, 0.2)}),
+        (RUNS_AWAY, {"speed": 1.3}),
+        (RUNS_AWAY, {"thrusts": (0.02, 0.02)}),
+        (RUNS_AWAY, {"draft": 0.5}),
+        (RUNS_AWAY, {"moves_from": 12.2}),
+        (STANDS, {"slips": (0.1, 0.2)}),
+        (STANDS, {"thrusts": (0.3, -1.0)}),
+    ],
+)
+def test_one_sign_less_is_no_stall(sign, otherwise):
+    """Slip that stays, speed that grows, no push, a draft that grows, a start, hardly any slip, a driver who stops."""
+    assert warnings(drive(**sign | otherwise)) == []

@@ -62,7 +62,7 @@ class Settings:
     max_turn: float  # relative difference of an axle's rim speeds above which instants are left out
     # sd of the change of each soil coordinate's logarithm in one window; it grows with the square root of time
     drift: float
-    min_rows: int = 8  # residuals below which a window is not fitted
+    min_rows: int = 15  # residuals below which a window is not fitted
     # how far each of `model_form.FORM` may be from the configured model; () holds the form
     form: tuple[float, ...] = ()
     search_rate: float = 4.0  # evaluations of the model that searches may take, see `SearchBudget`
