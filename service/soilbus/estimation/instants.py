@@ -22,9 +22,9 @@ _QUANTITIES = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
 
 
 def instant_of(rig: Rig, length: float) -> float:
-    """Return the length [s] of a machine's instants, this or a bounce where loads are computed.
+    """Return the length [s] of a machine's instants: `length`, or at least a bounce where loads are computed.
 
-    It is 0, bins as they are, on tracks: no tyre relaxes or bounces.
+    On tracks it is 0, which keeps the bins: no tyre relaxes or bounces.
     """
     lengths, given = rig.lengths, rig.instrumentation
     if lengths is not None and (lengths > 0.0).all():
@@ -71,7 +71,10 @@ def averaged(window: Window, end: float, length: float) -> Window:
 
 
 def _ratios(window: Window, starts: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Mean of V / omega (N, W) in the instants that begin at starts (N,), and its relative sd beyond bins' noise."""
+    """Mean of V / omega (N, W) in the instants that begin at starts (N,), and its relative sd less the noise of bins.
+
+    The sd is at most a half, so that V / omega stays positive one sd below its mean.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = window.ground_speed[:, None] / window.speed
         noise = window.variance["ground_speed"] / window.ground_speed**2

@@ -146,8 +146,8 @@ class Response(NamedTuple):
 def eliminate_slip(values: Array, by_slip: Array, free: NDArray[np.bool_]) -> None:
     """Take the slips of free wheels (mask (W,)) out of values (3, ..., N, W) by T = 0, to first order, in place.
 
-    y <- y - (dy/ds) / (dT/ds) T for pull, torque and sinkage or their derivatives; by_slip (3, N, W): those by the slip
-    or what it follows.
+    y <- y - (dy/ds) / (dT/ds) T, where y is pull, torque and sinkage, or their derivatives by something.  by_slip
+    (3, N, W): their derivatives by the slip, or by the wheel's speed.
     """
     torque = by_slip[1][:, free]
     ratio = by_slip[:, :, free] / np.where(torque == 0.0, np.inf, torque)

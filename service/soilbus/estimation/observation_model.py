@@ -258,7 +258,10 @@ class ObservationModel(Measurements):
         return np.asarray(np.clip(1.0 - ratio + np.clip(step, -limit, limit), -most, 0.0))
 
     def _mean_response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
-        """Mean of the responses at one sd of each wheel's V / omega above and below its mean in an instant."""
+        """The mean of an instant's response while slip swings, by two Gauss-Hermite nodes.
+
+        They are one sd of each wheel's V / omega above and below its mean.
+        """
         if not self.swing.any():
             return self._response(soil, gains, latents)
         two = list[Response]()

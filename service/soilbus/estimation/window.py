@@ -153,7 +153,7 @@ class Window:
     # (N,), -1 where the vehicle reversed before `forward`, else 1
     direction: Array = field(default_factory=lambda: np.empty(0))
     observations: Observations | None = None  # of `instrumentation.completed`
-    # (N, W) relative sd of V / omega within an instant, of `instants.averaged`
+    # (N, W), relative sd of V / omega within an instant; 0 in single bins
     swing: Array = field(default_factory=lambda: np.empty((0, 0)))
     kinematic: bool = False  # whether an acceleration that was a specific force has become dv/dt
 
