@@ -77,7 +77,7 @@ class Usual:
     slips: tuple[tuple[str, float], ...] = ()
 
     def __call__(self, value: float) -> float:
-        """The same value; ValueError for one that no machine has."""
+        """Return the value; raise ValueError for one that no machine has."""
         if not self.low <= value <= self.high:
             raise ValueError(self._fault(value))
         return value

@@ -6,7 +6,7 @@
     transfer        changes of the front axle's load less the rear's = twice those by moments of draft, slope, inertia
     balance         changes of sum(torque / r) = 0.7 to 1.0 * changes of draft, and of slope + inertia
     sides           left less right: torque = a * load + b * slip + constant, with a > 0 and b > 0
-    wheel speed     slip = a * thrust over load + an error of the radius, a > 0: on no ground is it nothing
+    wheel speed     slip = a * thrust over load + an error of the radius, a > 0 on every ground
     accelerometer   changes of its readings = a * changes of ground speed + b * those of g sin(pitch), a = 1, and b = 1
                     where it feels gravity, else 0
     slope           changes of thrust rise with those of m g sin(pitch)
@@ -136,7 +136,7 @@ FACTORS = {
     2.0: "does each load cell read a whole axle?",
     0.5: "does a load cell read only half of its wheel's load?",
 }
-"""Likely mistakes by the multiple of what loads should be."""
+"""The likely mistake where the loads sum up to this multiple of the weight."""
 
 
 FASTER = {
@@ -146,7 +146,7 @@ FASTER = {
     1.0 / 3.6: "is the ground speed in km/h where the DBC says m/s, ",
     math.pi / 30.0: "are the wheel speeds in rad/s where the DBC says rpm, ",
 }
-"""Likely mistakes by how many times as fast as the ground they make the rims."""
+"""The likely mistake where rims seem to run this many times as fast as the ground."""
 
 
 def _likely(mistakes: Mapping[float, str], ratio: float, least: float, most: float) -> str:
