@@ -59,8 +59,8 @@ def left_by(
     step, age = t - last, t - before.since
     rows = np.vstack([before.rows[before.rows[:, 0] > t - options.warning_time], (*row, math.nan)])
     x = rows[:, 0] - t
-    demand, _ = _line(x, rows[:, 3], options.slow_memory)
-    _, rise = _line(x, rows[:, 3], options.forgetting_time)
+    weights = np.exp(x / np.array([[options.slow_memory], [options.fast_memory], [options.forgetting_time]]))
+    (demand, _), _, (_, rise) = _lines(weights, x, rows[:, 3])
     rows[-1, 4] = demand + options.settling_time * rise
     error, checks = before.error, before.checks
     past = rows[x <= 0.5 * step - options.settling_time]
@@ -79,12 +79,13 @@ def left_by(
     if compares and float(rows[x > 0.5 * step - options.scatter_lag, 3].min()) > (1.0 - options.form_error) * most:
         now = now._replace(cause="draft and slope take nearly all that the ground gives")
     reserve = ahead[np.searchsorted(slips, rows[:, 1], "right")] - np.interp(rows[:, 1], slips, pulls)
-    capacity = np.where(rows[:, 1] >= slips[0], rows[:, 2] + reserve, np.nan)
+    known = rows[:, 1] >= slips[0]
     lately = x > -options.slow_memory
-    if 2 * np.count_nonzero(np.isfinite(capacity[lately])) <= np.count_nonzero(lately):
+    if 2 * np.count_nonzero(known[lately]) <= np.count_nonzero(lately):
         return now
 
-    limit = min(_line(x, capacity, options.slow_memory)[0], most)
+    capacity, weights = (rows[:, 2] + reserve)[known], weights[:2, known]
+    limit = min(_lines(weights[:1], x[known], capacity)[0][0], most)
     works = compares and age >= options.warning_time and demand > options.least_share * limit
     outgrows = math.inf
     if works and rise > 0.0 and checks:
@@ -93,7 +94,8 @@ def left_by(
         wrong = math.sqrt(error / checks) * options.warning_time / options.settling_time
         if 0.5 * math.erfc(spare / (math.sqrt(2.0) * math.hypot(wrong, width, 1e-9))) > options.outgrows:
             outgrows = max(limit - demand, 0.0) / rise
-    weakens = _time_to_weaken(x, capacity, reserve, float(rows[:, 3].max()), options)
+    terms = np.stack([np.ones_like(x), x, reserve, _rate(reserve, x)])[:, known]
+    weakens = _time_to_weaken(terms, weights, capacity, float(rows[:, 3].max()), options)
     now = now._replace(time_left=min(outgrows, weakens))
     if outgrows == math.inf and not weakens < options.warning_time:
         return now
@@ -105,18 +107,24 @@ def left_by(
     return now._replace(calm=before.calm, cause=cause)
 
 
-def _line(x: Array, y: Array, memory: float) -> tuple[float, float]:
-    """Value now and slope of the line through values (N,), nan where not known, at times x [s] from now."""
-    known = np.isfinite(y)
-    x, y = x[known], y[known]
-    if not len(x):
-        return math.nan, 0.0
-    weight = np.exp(x / memory)
-    weight /= weight.sum()
-    t, mean = float(weight @ x), float(weight @ y)
-    spread = float(weight @ (x - t) ** 2)
-    slope = float((weight * (x - t)) @ y) / spread if spread > 1e-9 else 0.0
-    return mean - slope * t, slope
+def _lines(weights: Array, x: Array, y: Array) -> list[tuple[float, float]]:
+    """Value at 0 and slope of the line through y (N,) at x for each row of weights (M, N)."""
+    sums = weights @ np.stack([np.ones_like(x), x, x * x, y, x * y], axis=1)
+    lines = []
+    for count, of_x, of_xx, of_y, of_xy in sums.tolist():
+        spread = count * of_xx - of_x**2
+        slope = (count * of_xy - of_x * of_y) / spread if spread > 1e-9 * count**2 else 0.0
+        lines.append(((of_y - slope * of_x) / count, slope))
+    return lines
+
+
+def _rate(y: Array, x: Array) -> Array:
+    """Central differences (N,) of y over x, one-sided at the ends; 0 for a single value."""
+    if len(x) < 2:
+        return np.zeros_like(y)
+    steps = np.concatenate([[0], np.arange(len(x)), [len(x) - 1]])
+    before, after = steps[:-2], steps[2:]
+    return np.asarray((y[after] - y[before]) / (x[after] - x[before]))
 
 
 @lru_cache(maxsize=2)
@@ -128,32 +136,27 @@ def _known(curve: OverSlip) -> tuple[Array, Array, Array, float]:
     return curve.slip[known], pull, ahead, float(curve.pull_std[int(np.nanargmax(curve.pull))])
 
 
-def _time_to_weaken(x: Array, capacity: Array, reserve: Array, peak: float, options: WatchOptions) -> float:
+def _time_to_weaken(terms: Array, weights: Array, capacity: Array, peak: float, options: WatchOptions) -> float:
     """Time [s] until c + b x + e R + d dR/dt falls to the peak [N] of demand without d; inf if not sure.
 
-    e: error of the reserve R; d [s]: how late the pull is beside the slip.
+    terms (4, N): 1, x, R, dR/dt.  weights (2, N): of a slow and a fast trend.  capacity (N,) [N].  e: error of the
+    reserve R; d [s]: how late the pull is beside the slip.
     """
-    if len(x) < 4:
-        return math.inf
-    moves, known = np.gradient(reserve, x), np.isfinite(capacity)
-    x, capacity, reserve, moves = x[known], capacity[known], reserve[known], moves[known]
-    lag = options.scatter_lag
-    changes = [
-        (capacity - capacity[np.searchsorted(x, x - apart - 1e-6)])[x > x[0] + apart] for apart in (0.5 * lag, lag)
-    ]
-    if len(changes[-1]) < 4:
-        return math.inf
-    like = lag * (len(x) - 1) / (x[-1] - x[0])  # rows with the same scatter
-    # over half the lag too: a bounce at 2 Hz does not show in changes over 0.5 s
-    scatter = max(float(change @ change) / len(change) / 2.0 for change in changes)
-    variance = max(scatter, 1.0) * like
-    columns = np.stack([np.ones_like(x), x, reserve, moves])
+    x, lag, n = terms[1], options.scatter_lag, len(capacity)
+    scatter = 1.0
+    for apart in (lag, 0.5 * lag):  # over half the lag too: a bounce at 2 Hz does not show in changes over 0.5 s
+        first = int(np.searchsorted(x, x[0] + apart, "right"))
+        change = capacity[first:] - capacity[np.searchsorted(x, x[first:] - apart - 1e-6)]
+        if len(change) < 4:
+            return math.inf
+        scatter = max(scatter, float(change @ change) / len(change) / 2.0)
+    variance = scatter * lag * (n - 1) / (x[-1] - x[0])  # rows with the same scatter
     prior = np.diag([0.0, 0.0, options.form_error**-2, options.lateness**-2])
+    weighted = weights[:, None] * terms / variance
+    covariance = np.linalg.inv(weighted @ terms.T + prior)
+    found = (covariance @ (weighted @ capacity)[..., None])[..., 0]
     left = math.inf
-    for memory in (options.slow_memory, options.fast_memory):
-        weighted = columns * np.exp(x / memory)
-        covariance = np.linalg.inv(weighted @ columns.T / variance + prior)
-        now, slope, error, _ = (covariance @ (weighted @ capacity) / variance).tolist()
-        if slope < -options.significant_sd * math.sqrt(covariance[1, 1]):
-            left = min(left, max(now + error * float(reserve[-1]) - peak, 0.0) / -slope)
+    for (now, slope, error, _), std in zip(found.tolist(), np.sqrt(covariance[:, 1, 1]).tolist(), strict=True):
+        if slope < -options.significant_sd * std:
+            left = min(left, max(now + error * float(terms[2, -1]) - peak, 0.0) / -slope)
     return left
