@@ -18,6 +18,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.decision.balance import (
@@ -65,6 +66,8 @@ class Demand:
 class OverSlip:
     """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m], with their std.
 
+    engaged: which of all wheels drive; empty where not known.
+
     Equation 22 and figure 13 of Xi et al. 2024, with load transfer; nan where by the most likely soil, or by most soils
     of the posterior, no wheel loads and sinkages are in balance.
     """
@@ -74,6 +77,7 @@ class OverSlip:
     pull_std: Array
     torque: Array
     torque_std: Array
+    engaged: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +211,7 @@ def assess(
         limit=draft.cause,
         set_points=_set_points(axles, level, points, limits, draft),
         forecast=forecast,
-        over_slip=_over_slip(level, table, points),
+        over_slip=_over_slip(level, table, points, rig.drives & driven),
     ), table
 
 
@@ -295,11 +299,11 @@ def _forecast(
     return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required, likely_depth)
 
 
-def _over_slip(level: Balance, table: WheelTable, points: SigmaPoints) -> OverSlip:
-    """Mean and std of pull and torque at the slips of the coarse grid."""
+def _over_slip(level: Balance, table: WheelTable, points: SigmaPoints, engaged: NDArray[np.bool_]) -> OverSlip:
+    """Mean and std of pull and torque at the slips of the coarse grid, with those wheels engaged (W,)."""
     known = level.known[:, ::SUBDIVISIONS].copy()
     known[:, 1:] |= level.known[:, SUBDIVISIONS - 1 :: SUBDIVISIONS]
     torque = (level.torque[..., ::SUBDIVISIONS] * table.axles.count).sum(axis=1)
     both = np.where(known[:, None], np.stack([level.pull[:, ::SUBDIVISIONS], torque], axis=1), np.nan)
     (pull, torque), (pull_std, torque_std) = points.mean_and_std(both)
-    return OverSlip(table.slip, pull, pull_std, torque, torque_std)
+    return OverSlip(table.slip, pull, pull_std, torque, torque_std, tuple(engaged.tolist()))

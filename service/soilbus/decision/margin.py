@@ -2,7 +2,7 @@
 
     weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q, beyond what a wrong curve explains
     outgrows       P(Q + h dQ/dt > C) > p, by the errors of earlier such extrapolations and the curve's width
-    takes all      Q > (1 - e) max P_hat, e: how wrong the curve may be, or s > s_max
+    takes all      P(Q > (1 - e) max P_hat) > p, e: how wrong the curve may be, or s > s_max
 
 P: pull given, P_hat: pull over slip of the last window.  The moments are kept and seen along the newest curve: so a new
 window is no new ground.  Trends are regressions whose rows count e^(x / memory), x: time [s] from now.  dQ/dt is a
@@ -75,8 +75,8 @@ def left_by(
         return now._replace(cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
     if most <= 0.0:
         return now
-    compares = std < options.unknown * most
-    if compares and float(rows[x > 0.5 * step - options.scatter_lag, 3].min()) > (1.0 - options.form_error) * most:
+    least = float(rows[x > 0.5 * step - options.scatter_lag, 3].min())
+    if _above(least / (1.0 - options.form_error) - most, std) > options.takes_all:
         now = now._replace(cause="draft and slope take nearly all that the ground gives")
     reserve = ahead[np.searchsorted(slips, rows[:, 1], "right")] - np.interp(rows[:, 1], slips, pulls)
     known = rows[:, 1] >= slips[0]
@@ -86,16 +86,17 @@ def left_by(
 
     capacity, weights = (rows[:, 2] + reserve)[known], weights[:2, known]
     limit = min(_lines(weights[:1], x[known], capacity)[0][0], most)
-    works = compares and age >= options.warning_time and demand > options.least_share * limit
+    works = age >= options.warning_time and demand > options.least_share * limit
     outgrows = math.inf
     if works and rise > 0.0 and checks:
-        width = min(std, options.form_error * most)
-        spare = limit - width - demand - options.warning_time * rise
         wrong = math.sqrt(error / checks) * options.warning_time / options.settling_time
-        if 0.5 * math.erfc(spare / (math.sqrt(2.0) * math.hypot(wrong, width, 1e-9))) > options.outgrows:
+        beyond = demand + options.warning_time * rise + std - limit
+        if _above(beyond, math.hypot(wrong, std)) > options.outgrows:
             outgrows = max(limit - demand, 0.0) / rise
     terms = np.stack([np.ones_like(x), x, reserve, _rate(reserve, x)])[:, known]
-    weakens = _time_to_weaken(terms, weights, capacity, float(rows[:, 3].max()), options)
+    lasts = max(round(options.scatter_lag * (len(x) - 1) / -x[0]), 1)
+    peak = float(np.convolve(rows[:, 3], np.full(lasts, 1.0 / lasts), "valid").max())
+    weakens = _time_to_weaken(terms, weights, capacity, peak, options)
     now = now._replace(time_left=min(outgrows, weakens))
     if outgrows == math.inf and not weakens < options.warning_time:
         return now
@@ -154,9 +155,14 @@ def _time_to_weaken(terms: Array, weights: Array, capacity: Array, peak: float, 
     prior = np.diag([0.0, 0.0, options.form_error**-2, options.lateness**-2])
     weighted = weights[:, None] * terms / variance
     covariance = np.linalg.inv(weighted @ terms.T + prior)
-    found = (covariance @ (weighted @ capacity)[..., None])[..., 0]
     left = math.inf
-    for (now, slope, error, _), std in zip(found.tolist(), np.sqrt(covariance[:, 1, 1]).tolist(), strict=True):
-        if slope < -options.significant_sd * std:
-            left = min(left, max(now + error * float(terms[2, -1]) - peak, 0.0) / -slope)
+    for found, spread in zip(covariance @ (weighted @ capacity)[..., None], covariance, strict=True):
+        now, slope = float(found[0, 0] + terms[2, -1] * found[2, 0]), float(found[1, 0])
+        if slope < -options.significant_sd * math.sqrt(spread[1, 1]):
+            left = min(left, max(now - peak, 0.0) / -slope)
     return left
+
+
+def _above(excess: float, std: float) -> float:
+    """Probability that a quantity with this mean and sd is above zero."""
+    return 0.5 * math.erfc(-excess / (math.sqrt(2.0) * max(std, 1e-9)))

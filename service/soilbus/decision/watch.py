@@ -78,11 +78,13 @@ def watched(
     """Return the watch after one more moment; moments in their order, at any rate.
 
     The trends start afresh after LONGEST_GAP, or when time goes back.  curve: pull over slip of the last window that
-    had one.  config: `min_speed` [m/s], above which the vehicle moves; limits and times of `traversability` and
-    `warning`.
+    had one, which counts while the same wheels drive.  config: `min_speed` [m/s], above which the vehicle moves;
+    limits and times of `traversability` and `warning`.
     """
     now = _stalled(_moved(before, moment, config), before, moment, config, options)
     margin = before.margin if moment.engaged == before.engaged else before.margin.afresh()  # along another curve
+    if curve is not None and curve.engaged != moment.engaged:
+        curve = None
     if math.isfinite(moment.common + moment.given):
         asked = moment.given - moment.inertia + moment.mass * now.stall.slope
         if not len(margin.rows) or moment.t != margin.rows[-1, 0]:
