@@ -71,11 +71,12 @@ def left_by(
         return now
     slips, pulls, ahead, std = _known(curve)
     most = float(ahead[0])
-    if slip >= slips[-1]:
+    lately = x > 0.5 * step - options.scatter_lag
+    if slip >= slips[-1] and x[lately][0] < -0.5 * options.scatter_lag:  # it has not just started
         return now._replace(cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
     if most <= 0.0:
         return now
-    least = float(rows[x > 0.5 * step - options.scatter_lag, 3].min())
+    least = float(rows[lately, 3].min())
     if _above(least / (1.0 - options.form_error) - most, std) > options.takes_all:
         now = now._replace(cause="draft and slope take nearly all that the ground gives")
     reserve = ahead[np.searchsorted(slips, rows[:, 1], "right")] - np.interp(rows[:, 1], slips, pulls)

@@ -1,6 +1,6 @@
 """The watch for immobilisation: one state machine, ten times a second, that says what it sees and warns.
 
-    spins          v_s > max(v_min, s_max r omega)                   a wheel; no loss while others grip with torque left
+    spins          r omega > v_min, v_s > max(v_min, s_max r omega)  a wheel; no loss while others grip with torque left
     stalls         V < v_min, no wheel turns, and thrust exceeds the pull, or all motors are at their limits
     `stall`        slip runs away, speed or depth leads to its limit: needs no soil
     `margin`       the curve of pull over slip and what is measured leave ever less, or too little
@@ -140,7 +140,7 @@ def _moved(before: Watch, moment: Moment, config: Config) -> Watch:
     if not known or not math.isfinite(moment.ground):
         return before._replace(t=t, slip=math.nan, pull=math.nan)
     spin_now = [
-        rim - (moment.ground + more) > max(min_speed, settings.max_slip * rim)
+        rim > min_speed and rim - (moment.ground + more) > max(min_speed, settings.max_slip * rim)
         for rim, more in zip(moment.rim, beside, strict=True)  # nor nan
     ]
     spinning, stands = sum(spin_now), moment.ground < min_speed
