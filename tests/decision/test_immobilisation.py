@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -202,6 +203,54 @@ def test_a_curve_that_is_wrong_by_a_factor_shows_no_weaker_ground_where_the_draf
 
     assert not warned(lambda t: 0.0)
     assert warned(lambda t: 100.0 * max(t - 35.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("relative_std", "share", "warns"), [(0.05, 0.92, True), (0.05, 0.88, False), (0.4, 0.92, False)]
+)
+def test_a_demand_takes_nearly_all_of_a_curve_that_is_known_well(relative_std, share, warns):
+    curve = OverSlip(SLIP, pull_at(SLIP), relative_std * pull_at(SLIP), NONE, NONE)
+    state, pull = Watch(), share * MOST
+    for i in range(100):
+        state = watched(state, look(0.1 * i, slip_at(pull), pull), curve, CONFIG)
+    assert (state.warning is Alert.IMMOBILISATION) == warns
+
+
+def test_a_curve_counts_while_the_same_wheels_drive():
+    """On two wheels 2500 N are nearly all that the ground gives, on four they are not."""
+    two, four = (False, False, True, True), (True,) * 4
+    curve = replace(CURVE, pull=pull_at(SLIP) * 2600.0 / MOST, engaged=two)
+
+    def warning(engaged):
+        state = Watch()
+        for i in range(100):
+            moment = look(0.1 * i, 0.3, 2500.0)._replace(engaged=engaged)
+            state = watched(state, moment, curve, CONFIG)
+        return state.warning
+
+    assert warning(two) is Alert.IMMOBILISATION
+    assert warning(four) is Alert.NONE
+
+
+def test_slip_beyond_the_limit_at_a_start_is_no_immobilisation():
+    """The ground speed comes 0.3 s late, so that the first slip of each start is too large."""
+    state = Watch()
+    for i in range(60):
+        moment = look(0.1 * i, 0.7 if i % 20 == 7 else 0.2, 1500.0) if i % 20 >= 7 else look(0.1 * i, None, None)
+        state = watched(state, moment, CURVE, CONFIG)
+        assert state.warning is not Alert.IMMOBILISATION
+    for i in range(60, 66):
+        state = watched(state, look(0.1 * i, 0.7, 1500.0), CURVE, CONFIG)
+    assert state.warning is Alert.IMMOBILISATION
+    assert state.time_left == 0.0
+
+
+@pytest.mark.parametrize(("rim", "spins"), [(0.05, False), (0.5, True)])
+def test_a_wheel_that_stands_while_the_vehicle_rolls_back_does_not_spin(rim, spins):
+    state = Watch()
+    for i in range(30):
+        state = watched(state, look(0.1 * i, None, 0.0)._replace(ground=-0.3, rim=[rim] * 4), None, CONFIG)
+    assert state.spinning == spins
 
 
 def test_scattering_ground_must_surely_weaken():
