@@ -1,7 +1,5 @@
 """`import soilbus`: what it loads, and what each function of the library answers."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Logs of two vehicles, some of them broken, and a Dask cluster within the process."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

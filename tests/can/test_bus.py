@@ -1,7 +1,5 @@
 """The python-can adapter against buses that fail as the kernel does."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import itertools

@@ -1,7 +1,5 @@
 """The column decoder against cantools, bit for bit."""
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One drive in the formats in which people have their logs: each gives the same frames, or a reason."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import json

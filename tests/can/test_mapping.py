@@ -1,7 +1,5 @@
 """Configuration and DBC -> channels: units, gears, limits, and one clear line for each fault."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The limits of a log that is made to fill memory or time, and the channel whose frames are read."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma

@@ -1,7 +1,5 @@
 """Commands as a user types them: exit codes, one line for each fault, nothing half-written."""
 
-from __future__ import annotations
-
 import errno
 import gzip
 import itertools

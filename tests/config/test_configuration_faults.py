@@ -1,7 +1,5 @@
 """Mistakes in a configuration are told in the words of its file, to someone who knows vehicles and not programs."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """What is decided between two windows, and in reverse, has the same inputs and the same vehicle as the windows."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Windows in, states out: the decision as the service makes it, with a tracker that returns given outputs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

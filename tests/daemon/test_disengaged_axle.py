@@ -3,8 +3,6 @@
 The truth is the rear-driven tractor, whose front wheels roll freely; the configuration has a shaft to both axles.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from functools import cache

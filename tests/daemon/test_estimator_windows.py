@@ -1,7 +1,5 @@
 """Windows in, results out: noise configured wrong, new ground that is not valid yet, and the watch on gaps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """GO ends with the facts: frames of drives that end stuck in, frames and windows out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ window must have.  Of every row holds besides: a window that calls itself valid 
 a fault for which the status is not valid.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Wild samples and reversing, from frames to windows."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

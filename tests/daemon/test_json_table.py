@@ -1,7 +1,5 @@
 """The page's table of JSON keys is the table of the keys that a line has."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several logs: each is a recording of its own, nothing of any is lost, and what is damaged takes nothing with it."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

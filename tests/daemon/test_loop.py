@@ -1,7 +1,5 @@
 """The loop with a clock and a bus in hand: what it sends, when, and that it fails safe."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import math

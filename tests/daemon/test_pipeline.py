@@ -1,7 +1,5 @@
 """The recordings of the field vehicle, whole and mutilated, through the pipeline."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

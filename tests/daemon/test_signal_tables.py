@@ -1,7 +1,5 @@
 """Tables of decoded signals: the same windows as the log that they were decoded from, by an independent decoder."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables of a test rig: what is read, what is refused and why, and whether the estimate is as good as it says."""
 
-from __future__ import annotations
-
 import json
 import lzma
 import re

@@ -1,7 +1,5 @@
 """Capability against brute force (nested scipy root finding)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """The watch for immobilisation: made-up ground whose end is known, whatever frames bring, and simulated drives."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

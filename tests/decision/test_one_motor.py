@@ -3,8 +3,6 @@
 Brute force: the slip is scanned, the draft of each slip found by root finding, each free wheel's slip by T = 0.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The decision: probability against Monte Carlo, and go only when everything speaks for it."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """A mass that is uncertain is estimated by the window, and what it leaves open is part of the largest draft's std."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

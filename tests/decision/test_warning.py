@@ -4,8 +4,6 @@ J domega/dt = T - r F - r F_roll,    m dV/dt = sum F - R,    F = mu N (1.35 tanh
 R grows with the distance that each wheel turns more than its ground goes by; on a curve each wheel has its own ground.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from functools import cache

@@ -1,7 +1,5 @@
 """What a completed model says the tractor can pull is what the simulated tractor pulls."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

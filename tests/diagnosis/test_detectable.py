@@ -1,7 +1,5 @@
 """What a recording could have shown: sizes from the Fisher information, held against effects that are truly there."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

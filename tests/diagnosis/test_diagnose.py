@@ -1,7 +1,5 @@
 """The soil's std after effects were added: an effect that changed it much may have changed it wrongly."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

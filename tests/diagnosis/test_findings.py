@@ -1,7 +1,5 @@
 """Text, JSON and page of diagnoses that are not clear: a set of names, a gap without a name, numbers that are none."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

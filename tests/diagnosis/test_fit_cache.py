@@ -1,7 +1,5 @@
 """FitCache: a model is fitted once, and from elsewhere where it explains less than one with fewer effects."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

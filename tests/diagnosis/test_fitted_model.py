@@ -1,7 +1,5 @@
 """A zero that wanders does so otherwise in every recording; what stays of it is the zero at the end of the last."""
 
-from __future__ import annotations
-
 from records import recorded
 from soilbus.can.channels import Column
 from soilbus.diagnosis.fitted_model import fit_model

@@ -1,7 +1,5 @@
 """Fits from starts: where -2 log posterior is underestimated, at the edge of a range, with other effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

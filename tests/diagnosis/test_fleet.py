@@ -1,7 +1,5 @@
 """A fleet's diagnosis: few of the names are false, and a fault is found where it is and from its first log on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

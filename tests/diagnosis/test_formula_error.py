@@ -1,7 +1,5 @@
 """What the formula of a true effect leaves gets no name, whoever has put that effect into the model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 

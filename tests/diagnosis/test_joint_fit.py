@@ -1,7 +1,5 @@
 """A model fitted to several recordings of a vehicle is the same in whatever order they come."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

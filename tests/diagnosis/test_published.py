@@ -1,7 +1,5 @@
 """What published single-wheel points show in any case."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import NamedTuple

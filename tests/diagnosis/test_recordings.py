@@ -1,7 +1,5 @@
 """Logs as whole records: the bins are those of replay, and a set clock or a long silence begins another part."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

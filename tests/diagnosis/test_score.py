@@ -1,7 +1,5 @@
 """What is proportional to a noisy reading is estimated without bias, however loosely it is known."""
 
-from __future__ import annotations
-
 import pytest
 
 from records import recorded

@@ -1,7 +1,5 @@
 """The stepwise search: predictions by scores, swaps, and fits that are not repeated or given up."""
 
-from __future__ import annotations
-
 from itertools import islice, product
 
 import numpy as np

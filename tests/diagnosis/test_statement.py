@@ -1,7 +1,5 @@
 """No diagnosis contradicts itself: verdict, gap, places and what could be seen say the same."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

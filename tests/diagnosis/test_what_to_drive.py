@@ -1,7 +1,5 @@
 """What to drive next: the manoeuvre tells rivals apart, can be driven, and more recordings do not mislead the score."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Where model and data disagree: nowhere where nothing is missing, and there where something was hidden."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Machines of which not every wheel has a torque, a speed and a load: rows, derivatives, noise, intervals."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import replace

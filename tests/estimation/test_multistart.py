@@ -1,7 +1,5 @@
 """Fits of simulated windows: errors as reported, the same optimum from every start, missing and impossible data."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The eliminated latents against explicit minimisation, and the residuals' covariance against Monte Carlo."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which sensor lies: never one on a good drive, however harsh, whatever the soil or effect."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Relaxation, wheel inertia and late channels: derivatives, and drives that have them give them back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

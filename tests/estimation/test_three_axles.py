@@ -1,7 +1,5 @@
 """Machines with three axles: how they share their load, what they know of the soil, and how much they can pull."""
 
-from __future__ import annotations
-
 import dataclasses
 import tomllib
 from pathlib import Path

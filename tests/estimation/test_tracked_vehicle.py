@@ -1,7 +1,5 @@
 """A crawler with two tracks from its configuration to soil and capability."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tracker on simulated drives: over a border, on one soil for minutes, with failures on the way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ A window is valid once it determines the bearing pressure of a plate at a given 
 its own tyres at about half their sinkage, and tan phi, sooner, even where loads hardly change.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Soil and gains drift: intervals hold where the soil does, and an hour without measurements leaves little."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gains of the last run as prior after a pause, on the same or another soil."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Windows that the model does not describe cost no more than others: a budget ends searches that find nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tracker's states: what follows from what a window shows, without any data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

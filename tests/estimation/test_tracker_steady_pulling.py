@@ -1,7 +1,5 @@
 """Steady pulling determines little and is no error: an estimate, a decision and no gap in every window."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

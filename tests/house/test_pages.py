@@ -1,7 +1,5 @@
 """The generated pages are those of the code, and links between the pages lead somewhere."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

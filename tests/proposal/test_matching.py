@@ -1,7 +1,5 @@
 """Signals matched to roles on DBCs of several naming styles: what is right, what is wrong, what stays open."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Why windows are of no use and what to do: said in words, with the numbers of the drive."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The dashboard believes only fresh frames with a right checksum, and says the state at a glance on any terminal."""
 
-from __future__ import annotations
-
 import functools
 import io
 import itertools

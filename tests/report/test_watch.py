@@ -1,7 +1,5 @@
 """`soilbus watch` on a terminal, in a pipe, of a bus that goes away and of a recording."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io

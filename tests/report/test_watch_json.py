@@ -1,7 +1,5 @@
 """`soilbus watch --json`: what the frames say, in the keys and units of `replay --json`; how it ends."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """The simulated tractor is driven: by commands on the bus, by the line, step by step."""
 
-from __future__ import annotations
-
 import threading
 
 import can

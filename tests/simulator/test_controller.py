@@ -1,7 +1,5 @@
 """The example controller of service/docs against the simulated tractor, by the service's frames and the bus's time."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Effects act on the simulated wheels and sensors as they say, and the balance holds with them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

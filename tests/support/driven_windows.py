@@ -1,7 +1,5 @@
 """Simulated drives as the daemon's estimator and the tracker see them, window by window."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 

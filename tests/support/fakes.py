@@ -1,7 +1,5 @@
 """Scripted bus, clock and workers for tests, a service on them, and the frames of a simulated drive."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future

@@ -6,8 +6,6 @@ catalogue of effects), and a test compares the pages in `service/docs` with it.
     python tests/support/reference_pages.py service/docs     writes them again
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import inspect

@@ -6,8 +6,6 @@ The contact is that of `other_wheel`.  Each message has its own rate, phase and 
 delay, first-order lag, noise and fixed gain error (shared/field/README.md).
 """
 
-from __future__ import annotations
-
 import gzip
 import math
 from collections.abc import Mapping

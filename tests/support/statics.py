@@ -1,7 +1,5 @@
 """The reference tractor in balance by brute force: nested scipy root finding, moments written out."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import brentq
 

@@ -1,7 +1,5 @@
 """The watch for immobilisation on simulated drives, with options that may differ from the service's."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Four wheels on a soil and all that effects may depend on, made from one seed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

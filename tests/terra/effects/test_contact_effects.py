@@ -1,7 +1,5 @@
 """Effects of the contact against integrals by scipy, hand formulas and limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Effects of the vehicle and of its sensors against hand formulas, np.interp and exact derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
