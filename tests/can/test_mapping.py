@@ -310,7 +310,6 @@ def test_shipped_files_are_found_by_name_and_checked(tmp_path: Path, monkeypatch
 )
 def test_spellings(spelling: str, dimension: str, factor: float) -> None:
     unit = unit_of(spelling)
-    assert unit is not None
     assert (unit.dimension, unit.factor) == (dimension, pytest.approx(factor, rel=1e-15))
 
 

@@ -26,7 +26,6 @@ def records() -> list[Record]:
 
 def fitted(records: list[Record], *names: str) -> FittedModel:
     found = fit_model(records, prior_of(CONFIG), [CATALOGUE[name] for name in names])
-    assert found is not None
     assert found.converged
     return found
 

@@ -207,7 +207,6 @@ def test_a_signal_of_two_wheels_says_less_than_two_sensors(tmp_path):
         problem = ObservationModel(window_of(config, rig), rig, model_of(config), 0.2)
         objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
         model = objective.quadratic_model(objective.start(soil))
-        assert model is not None
         there = objective.gaussian(soil, np.zeros(len(problem.gain_std)), np.linalg.inv(model.information))
         said.append(there.posterior.tan_phi().std)
     assert said[1] > said[0]
@@ -310,7 +309,6 @@ def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     truth = modelled_drive(config, rig, np.arange(0.05, 6.0, 0.1))
     problem = ObservationModel(window_of(config, rig, swing=0.0), rig, model_of(config), 0.2)
     fit = fit_window(problem, prior_of(config))
-    assert fit is not None
     assert fit.converged
     latents = fit.optimum.latents
     slip = 1.0 - latents.ground_speed[:, None] / (rig.radius * latents.speed)
@@ -348,7 +346,6 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
         )  # fmt: skip
         drive = shaking.drive(seed, ground, duration=31.0, shake=4.0)
         for result in estimated(config, drive)[::2]:
-            assert result.posterior is not None
             tan_phi, pressure = result.posterior.tan_phi(), result.bearing
             off.append((tan_phi.value - np.tan(ground.phi)) / tan_phi.std)
             off.append(np.log(pressure.value / ground.bearing_pressure()) * pressure.value / pressure.std)
@@ -383,7 +380,6 @@ def test_torques_of_the_two_wheels_of_an_axle_show_how_its_load_is_shared_at_eac
     recording, rig = simulate(config, scenario, 3), rig_of(config)
     problem = observed(config, recording.channels, 10.0)
     fit = fit_window(problem, prior_of(config))
-    assert fit is not None
     for left, right in ((0, 1), (2, 3)):
         of_wheels = [np.interp(problem.t, recording.truth["t"], recording.truth[f"load.{rig.wheels[i]}"])
                      for i in (left, right)]  # fmt: skip

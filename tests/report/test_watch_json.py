@@ -168,8 +168,6 @@ def test_a_reader_that_has_seen_enough_ends_it_without_a_word() -> None:
     with subprocess.Popen(
         [*WATCH, str(SAMPLE), "--speed", "100"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         assert json.loads(process.stdout.readline())["traversability"]["state"] == "unknown"
         process.stdout.close()
         assert process.wait(timeout=20.0) == 0
@@ -180,8 +178,6 @@ def test_a_reader_that_has_seen_enough_ends_it_without_a_word() -> None:
 def test_a_signal_ends_it_between_two_lines(number: signal.Signals) -> None:
     """Each line is there at once, whole, though the recording goes on for a minute."""
     with subprocess.Popen([*WATCH, str(SAMPLE)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         first = process.stdout.readline()
         process.send_signal(number)
         rest = process.stdout.read()

@@ -85,7 +85,6 @@ def test_draft_and_speed_follow_the_commands_and_the_balance_holds():
 def test_what_the_ground_cannot_give_slows_the_vehicle_down_until_it_is_stuck():
     done = joined(list(steps(CONFIG, PULLING, 1, commanded=lambda t: Command(draft=11000.0 if t > 1.0 else None))))
     columns = done.columns
-    assert done.bogged_at is not None
     assert 1.0 < done.bogged_at < 6.0
     assert columns["ground_speed"][-1] < 0.3
     assert columns["slip.RL"][-1] > 0.9
