@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from fakes import feed_message, in_reverse
+from fakes import drive_messages, feed_message, in_reverse
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -160,7 +160,7 @@ def with_a_shaft_to_both_axles(lead: float = 1.0):
 def largest_draft(truth, config, seed: int):
     """Of the last window of a drive on loam."""
     intake = Intake(config, load_databases(config))
-    for message in frames(simulate(truth, excited("loam", 14.5), seed), truth):
+    for message in drive_messages(truth, 14.5, seed):
         feed_message(intake.admission, message)
     intake.ingest()
     estimator = WindowEstimator(config)
@@ -199,7 +199,7 @@ def test_an_engaged_front_axle_counts_also_where_its_gear_is_not_known_well(lead
 def test_a_front_axle_stays_disengaged_while_its_speeds_are_silent():
     config = with_a_shaft_to_both_axles()
     intake = Intake(config, load_databases(config))
-    for message in frames(simulate(TRUTH, excited("loam", 10.5), 3), TRUTH):
+    for message in drive_messages(TRUTH, 10.5):
         feed_message(intake.admission, message)
     intake.ingest()
     window, rig = intake.finish(message.timestamp)[0].window, intake.rig
@@ -236,7 +236,7 @@ def test_each_choice_of_axles_keeps_what_it_has_learned():
     trackers, drafts = [], []
     for part, truth in enumerate((config, TRUTH, config)):
         begin = 0.0
-        for message in frames(simulate(truth, excited("loam", 18.0), 5 + part), truth):
+        for message in drive_messages(truth, 18.0, 5 + part):
             begin = begin or message.timestamp
             message.timestamp += 18.0 * part
             feed_message(intake.admission, message)

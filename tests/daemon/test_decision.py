@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from driven_windows import task_of, tasks, windows
-from fakes import feed_message
+from fakes import drive_messages, feed_message
 from soilbus.can.dbc_files import load_databases
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traversability import State, Status, Traversability
@@ -16,7 +16,6 @@ from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
@@ -29,7 +28,7 @@ CONFIG = reference_configuration()
 def drawn_tasks() -> list[WindowTask]:
     """Windows of a good drive, from its frames."""
     pipeline = Pipeline(CONFIG, load_databases(CONFIG))
-    for message in frames(simulate(CONFIG, excited("loam", 16.0), 3), CONFIG):
+    for message in drive_messages(CONFIG, 16.0):
         feed_message(pipeline.admission, message)
     return pipeline.intake.finish(message.timestamp)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fakes import feed_message, in_reverse
+from fakes import drive_messages, feed_message, in_reverse
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config, machine, parse_config
@@ -282,7 +282,7 @@ def test_a_wheel_without_a_speed_sensor_has_no_slip():
         del wheel["speed"]
     config = parse_config(raw)
     intake = Intake(config, load_databases(config))
-    for message in frames(simulate(config, excited("loam", 11.5), seed=3), config):
+    for message in drive_messages(config, 11.5):
         feed_message(intake.admission, message)
     slip = intake.finish(message.timestamp)[0].slip
     assert slip["FL"] is None

@@ -32,9 +32,9 @@ __all__ = [
 FakeClock = PlayedClock
 
 
-def drive_messages(config: Config, seconds: float) -> list[can.Message]:
+def drive_messages(config: Config, seconds: float, seed: int = 3) -> list[can.Message]:
     """Frames of a good drive on loam: draft swings, slip is what the soil asks for."""
-    return list(frames(simulate(config, excited("loam", seconds), 3), config))
+    return list(frames(simulate(config, excited("loam", seconds), seed), config))
 
 
 def in_reverse(recording: Recording) -> Recording:
