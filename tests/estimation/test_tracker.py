@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from driven_windows import B_REF, Z_REF, errors, task_of, tasks, tracker_of, windows
+from driven_windows import B_REF, Z_REF, errors, soils_under, task_of, tasks, tracker_of, windows
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.change_detection import ChangeStatistic, Transition
@@ -16,12 +16,13 @@ from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, soil_along
+from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
 from soilbus.terra.soils import SOILS, soil_named
 from soilbus.terra.wheel import Soil
 from soilbus.trials.draft_trials import true_largest_draft
 
-SPEED_TO_BORDER = 1.5
+CONFIG = reference_configuration()
+SPEED = 1.5
 
 
 def off(tracked: TrackerOutput, soil: str) -> float:
@@ -30,7 +31,7 @@ def off(tracked: TrackerOutput, soil: str) -> float:
 
 
 SLOW_AT_THE_BORDER = {"speed": Swing(1.0, 1.8)}
-GRADUAL = {"speed": Swing(SPEED_TO_BORDER, SPEED_TO_BORDER + 1e-6), "transition": 5.0}
+GRADUAL = {"speed": Swing(SPEED, SPEED + 1e-6), "transition": 5.0}
 
 
 @pytest.mark.parametrize(
@@ -43,16 +44,13 @@ GRADUAL = {"speed": Swing(SPEED_TO_BORDER, SPEED_TO_BORDER + 1e-6), "transition"
 )
 def test_a_border_may_be_longer_than_thought(first, second, seed, at, how):
     # All of these were a mismatch until not one sample of the border was in the window any more.
-    config = reference_configuration()
-    scenario = Scenario(
-        at / SPEED_TO_BORDER + 12.0, (Patch(0.0, first), Patch(at, second)), slip=Swing(0.05, 0.40), **how
-    )
-    recording = simulate(config, scenario, seed)
+    scenario = Scenario(at / SPEED + 12.0, (Patch(0.0, first), Patch(at, second)), slip=Swing(0.05, 0.40), **how)
+    recording = simulate(CONFIG, scenario, seed)
     # Where the front wheels meet the border and the rear ones leave it.
     border = at + np.array([-1.0, 0.95 + scenario.transition])
     reached, left = np.interp(border, recording.truth["distance"], recording.truth["t"])
-    tracker = tracker_of(config)
-    for window, end in windows(config, recording):
+    tracker = tracker_of(CONFIG)
+    for window, end in windows(CONFIG, recording):
         result = tracker.estimate(window, end)
         if end < reached:
             assert result.state is TrackerState.STEADY
@@ -75,33 +73,29 @@ def test_a_border_may_be_longer_than_thought(first, second, seed, at, how):
 )
 def test_no_valid_window_near_a_border_is_wrong(first, second, at, transition, seed):
     # All of these had a valid window that far off.  Right is the soil anywhere between the axles.
-    config = reference_configuration()
     patches = (Patch(0.0, first), Patch(at, second))
     scenario = Scenario(
         at + transition + 8.0, patches, Swing(1.0, 1.0 + 1e-6), slip=Swing(0.05, 0.40), transition=transition
     )
-    recording = simulate(config, scenario, seed)
-    estimator, between = WindowEstimator(config), np.linspace(-0.95, 1.0, 9)
-    valid_after = 0
-    for window, end in windows(config, recording):
-        result = estimator.estimate(task_of(window, end, config, index=round(end - 10.0))).result
+    recording = simulate(CONFIG, scenario, seed)
+    estimator, valid_after = WindowEstimator(CONFIG), 0
+    for window, end in windows(CONFIG, recording):
+        result = estimator.estimate(task_of(window, end, CONFIG, index=round(end - 10.0))).result
         place = np.interp(end, recording.truth["t"], recording.truth["distance"])
         if result.status is Status.VALID and place > at - 2.0:
-            under = np.transpose(soil_along(patches, place + between, transition))
-            away = [np.abs(errors(result.posterior, Soil(*map(float, soil)))).max() for soil in under]
-            assert min(away) < 3.0
+            under = soils_under(recording, scenario, end, np.linspace(-0.95, 1.0, 9))
+            assert min(np.abs(errors(result.posterior, soil)).max() for soil in under) < 3.0
             valid_after += place > at + transition
     assert valid_after >= 1
 
 
 def two_visits(first: str, second: str, seed: int):
     """The tracker and its results of a second drive; nothing but a window without speeds lies between the two."""
-    config = reference_configuration()
-    tracker = tracker_of(config)
+    tracker = tracker_of(CONFIG)
     for soil, start in ((first, 0.0), (second, 30.0)):
         scenario = Scenario(13.0, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
         results = []
-        for window, end in windows(config, simulate(config, scenario, seed)):
+        for window, end in windows(CONFIG, simulate(CONFIG, scenario, seed)):
             results.append(tracker.estimate(replace(window, t=window.t + start), end + start))
         empty = replace(window, t=window.t + start, ground_speed=np.full(len(window.t), np.nan))
         assert tracker.estimate(empty, end + start).fit is None
@@ -153,10 +147,9 @@ def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
 
 
 def test_a_window_that_fails_leaves_what_is_known_alone():
-    config = reference_configuration()
     scenario = Scenario(16.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
-    drive = list(windows(config, simulate(config, scenario, 3)))
-    undisturbed, disturbed = tracker_of(config), tracker_of(config)
+    drive = list(windows(CONFIG, simulate(CONFIG, scenario, 3)))
+    undisturbed, disturbed = tracker_of(CONFIG), tracker_of(CONFIG)
     nonsense = np.random.default_rng(0)
     for i, (window, end) in enumerate(drive):
         undisturbed.estimate(window, end)
@@ -175,10 +168,9 @@ def test_a_window_that_fails_leaves_what_is_known_alone():
 
 
 def test_a_wheel_that_dies_drops_out():
-    config = reference_configuration()
     scenario = Scenario(24.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
-    tracker = tracker_of(config)
-    for window, end in windows(config, simulate(config, scenario, 4)):
+    tracker = tracker_of(CONFIG)
+    for window, end in windows(CONFIG, simulate(CONFIG, scenario, 4)):
         dead = window.t > 14.0
         torque = np.where(dead[:, None] & (np.arange(4) == 2), np.nan, window.torque)
         result = tracker.estimate(replace(window, torque=torque), end)
@@ -188,10 +180,9 @@ def test_a_wheel_that_dies_drops_out():
 
 # --- how soon a new soil is estimated, and whether its intervals hold ---
 
-CONFIG = reference_configuration()
 VEHICLE = CONFIG.vehicle
-SPEED, TRANSITION, BEFORE, AFTER = 1.5, 1.0, 15.0, 3.0
-"""Speed [m/s], length of the border [m], seconds on the first soil, at least, and on the second."""
+TRANSITION, BEFORE, AFTER = 1.0, 15.0, 3.0
+"""Length of the border [m], seconds on the first soil, at least, and on the second."""
 SPREAD = 2.0
 """Seconds over which the times of the border vary: windows end at whole ones."""
 OF_THIS_SOIL = ("none", "not_excited load_range", "not_excited slip_range", "not_excited load_range slip_range")
@@ -236,14 +227,12 @@ def crossed(pair: str, seed: int) -> list[Seen]:
     estimator, between = WindowEstimator(CONFIG), np.linspace(-behind, VEHICLE.wheelbase - behind, 17)
     for window, end in windows(CONFIG, recording):
         result = estimator.estimate(task_of(window, end, CONFIG, index=round(end - CONFIG.estimator.window))).result
-        place = np.interp(end, recording.truth["t"], recording.truth["distance"])
-        under = np.transpose(soil_along(soils, place + between, TRANSITION))
         posterior, away, of_tyres = result.posterior, np.nan, (np.nan, np.nan)
         if posterior is not None and result.bearing is not None:
-            soils_under = [Soil(*map(float, soil)) for soil in under]
-            away = min(float(np.abs(errors(posterior, soil)).max()) for soil in soils_under)
+            under = soils_under(recording, scenario, end, between)
+            away = min(float(np.abs(errors(posterior, soil)).max()) for soil in under)
             depth = {wheel.width: BEST_DEPTH * (result.sinkage[wheel.name] or np.nan) for wheel in CONFIG.wheel}
-            of_tyres = errors_of_tyres(posterior, soils_under, depth)
+            of_tyres = errors_of_tyres(posterior, under, depth)
         seen.append(Seen(end - left, result.status is Status.VALID, result.reason, away, *of_tyres))
     return seen
 

@@ -1,12 +1,14 @@
 """What the tracker keeps: soil and gains drift, the last run's gains are a prior, and searches have a budget."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from driven_windows import B_REF, Z_REF, errors, task_of, tasks, tracker_of, windows
+from driven_windows import B_REF, Z_REF, errors, soils_under, task_of, tasks, tracker_of, windows
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
@@ -15,24 +17,29 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.search_budget import SearchBudget
 from soilbus.estimation.standing import STANDING
-from soilbus.estimation.tracker import gain_errors
+from soilbus.estimation.tracker import Tracker, gain_errors
 from soilbus.estimation.window import Window
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import Patch, Scenario, Swing, excited, soil_along
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import Soil
 
 EACH_TEN_SECONDS = reference_configuration(["estimator.hop=10.0"])
 LENGTH = EACH_TEN_SECONDS.estimator.window
 GAINS = gains_of(rig_of(EACH_TEN_SECONDS))
+RICH = 40.0
+"""Seconds of the drive that determines the soil well."""
 
 
 @pytest.fixture(scope="module")
-def rich() -> list[tuple[Window, float]]:
-    """Four windows that determine the soil well."""
-    return list(windows(EACH_TEN_SECONDS, simulate(EACH_TEN_SECONDS, excited("loam", 40.0), 1)))
+def informed() -> Tracker:
+    """The tracker after four windows that determine the soil well."""
+    tracker = tracker_of(EACH_TEN_SECONDS)
+    for window, end in windows(EACH_TEN_SECONDS, simulate(EACH_TEN_SECONDS, excited("loam", RICH), 1)):
+        tracker.estimate(window, end)
+    return tracker
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +50,11 @@ def little() -> Window:
     return window.rows((window.t > LENGTH - 1.5).nonzero()[0])
 
 
-def after(pause: float, rich, little: Window) -> Fit:
-    """Fit of the little window, `pause` seconds after the informative ones."""
-    tracker, end = tracker_of(EACH_TEN_SECONDS), 0.0
-    for window, end in rich:
-        tracker.estimate(window, end)
-    end += pause + LENGTH
-    tracked = tracker.estimate(replace(little, t=little.t + (end - LENGTH)), end)
+def after(pause: float, informed: Tracker | None, little: Window) -> Fit:
+    """Fit of the little window, `pause` seconds after the informative ones if there were any."""
+    begin = 0.0 if informed is None else RICH + pause
+    tracker = tracker_of(EACH_TEN_SECONDS) if informed is None else deepcopy(informed)
+    tracked = tracker.estimate(replace(little, t=little.t + begin), begin + LENGTH)
     assert not tracked.mismatch
     return tracked.fit
 
@@ -66,15 +71,17 @@ def gain_stds(fit: Fit) -> list[float]:
     return [fit.mode.gain(i).std / std for i, std in of_sensors if std > 0.0]
 
 
-def test_the_soil_of_an_hour_ago_is_no_more_than_another_soil(rich, little):
-    alone, soon, late = (spreads(after(*given, little)) for given in ((0.0, []), (60.0, rich), (3600.0, rich)))
+def test_the_soil_of_an_hour_ago_is_no_more_than_another_soil(informed, little):
+    pauses = (0.0, None), (60.0, informed), (3600.0, informed)
+    alone, soon, late = (spreads(after(*given, little)) for given in pauses)
     assert soon[1] < 0.5 * alone[1]
     assert late[1] > 0.6 * alone[1]
     assert late[0] > 0.85 * alone[0]
 
 
-def test_gains_are_known_for_hours_and_not_for_ever(rich, little):
-    alone, soon, late = (gain_stds(after(*given, little)) for given in ((0.0, []), (900.0, rich), (5 * 86400.0, rich)))
+def test_gains_are_known_for_hours_and_not_for_ever(informed, little):
+    pauses = (0.0, None), (900.0, informed), (5 * 86400.0, informed)
+    alone, soon, late = (gain_stds(after(*given, little)) for given in pauses)
     assert sum(soon) < 0.8 * sum(alone)
     assert sum(late) > 0.9 * sum(alone)
 
@@ -109,9 +116,7 @@ def test_a_soil_that_drifts_as_configured_is_covered_where_the_wheels_are_now():
             result = tracker.estimate(window, end)
             if result.mismatch:  # slopes of up to 4 % in 10 s come by, of two parameters: not always one soil
                 continue
-            place = np.interp(end, recording.truth["t"], recording.truth["distance"])
-            here = Soil(*map(float, soil_along(scenario.soils, np.array(place), STEP)))
-            away.append(errors(result.fit.posterior, here))
+            away.append(errors(result.fit.posterior, *soils_under(recording, scenario, end)))
     assert len(away) > 0.85 * 2 * 51
     # About 20 independent windows: their rms is below 1.35 in 98 %.
     assert np.all(np.sqrt(np.mean(np.square(away), axis=0)) < 1.35)
@@ -128,9 +133,7 @@ def test_intervals_of_valid_windows_hold_on_soils_that_drift_much():
         for window, end in windows(config, recording):
             result = estimator.estimate(task_of(window, end, config, index=round(end - 10.0))).result
             if result.status is Status.VALID:
-                place = np.interp(end, recording.truth["t"], recording.truth["distance"])
-                here = Soil(*map(float, soil_along(scenario.soils, np.array(place), STEP)))
-                away.append(errors(result.posterior, here))
+                away.append(errors(result.posterior, *soils_under(recording, scenario, end)))
     assert len(away) > 30
     assert (np.mean(np.abs(away) < 1.96, axis=0) >= 0.9).all()
 
@@ -275,50 +278,66 @@ def with_draft(task, sign):
     return replace(task, window=replace(task.window, draft=sign * task.window.draft))
 
 
-def solved(config, long_drive, monkeypatch):
-    """Results of a drive, and the evaluations of a whole window that each took."""
+class Solved(NamedTuple):
+    """Results of a drive, the evaluations of a whole window that each took, and the estimator before some windows."""
+
+    results: list[WindowResult]
+    spent: np.ndarray
+    before: dict[int, WindowEstimator]
+
+
+def solved(config, drive, kept=()) -> Solved:
     count, linearise = [0], ObservationModel.linearise
 
     def counted(self, *args, **kwargs):
         count[0] += self.n
         return linearise(self, *args, **kwargs)
 
-    monkeypatch.setattr(ObservationModel, "linearise", counted)
-    estimator, results, spent = WindowEstimator(config), [], []
-    for task in long_drive:
-        before = count[0]
-        results.append(estimator.solve(task))
-        spent.append((count[0] - before) / len(task.window.t))
-    monkeypatch.undo()
-    return results, np.array(spent)
+    estimator, found = WindowEstimator(config), Solved([], np.zeros(len(drive)), {})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ObservationModel, "linearise", counted)
+        for i, task in enumerate(drive):
+            found.before.update({i: deepcopy(estimator)} if i in kept else {})
+            begun = count[0]
+            found.results.append(estimator.solve(task))
+            found.spent[i] = (count[0] - begun) / len(task.window.t)
+    return found
 
 
-def test_a_draft_of_the_wrong_sign_costs_no_more_than_one_of_the_right_sign(long_drive, monkeypatch):
-    good, right = solved(CONFIG, long_drive, monkeypatch)
-    assert not any(r.search_ended for r in good)
-    wrong = [with_draft(task, -1.0) for task in long_drive]
-    results, spent = solved(CONFIG, wrong, monkeypatch)
-    _, without = solved(UNLIMITED, wrong[:6], monkeypatch)
+BAD, HEALED = 10, 30
+"""Windows with a wrong draft after which the draft is right again, in two of the tests below."""
+
+
+@pytest.fixture(scope="module")
+def good(long_drive) -> Solved:
+    return solved(CONFIG, long_drive)
+
+
+@pytest.fixture(scope="module")
+def wrong(long_drive) -> Solved:
+    """The same drive with a draft of the wrong sign."""
+    return solved(CONFIG, [with_draft(task, -1.0) for task in long_drive], (BAD, HEALED))
+
+
+def test_a_draft_of_the_wrong_sign_costs_no_more_than_one_of_the_right_sign(long_drive, good, wrong):
+    assert not any(r.search_ended for r in good.results)
+    without = solved(UNLIMITED, [with_draft(task, -1.0) for task in long_drive[:6]])
     late = slice(26, None)  # what was kept for a start is spent by then
-    assert spent[late].mean() < 2.0 * right[late].mean() + 4.0
-    assert without.mean() > 2.0 * spent[late].mean()
-    assert any(r.search_ended for r in results)
-    assert all(r.status is not Status.VALID and r.reason == "model_mismatch" for r in results)
+    assert wrong.spent[late].mean() < 2.0 * good.spent[late].mean() + 4.0
+    assert without.spent.mean() > 2.0 * wrong.spent[late].mean()
+    assert any(r.search_ended for r in wrong.results)
+    assert all(r.status is not Status.VALID and r.reason == "model_mismatch" for r in wrong.results)
 
 
-def test_what_is_well_again_is_soon_found(long_drive):
-    estimator = WindowEstimator(CONFIG)
-    healed = 30
-    results = [estimator.solve(with_draft(task, -1.0 if i < healed else 1.0)) for i, task in enumerate(long_drive)]
-    first = next(i for i, r in enumerate(results) if r.status is Status.VALID)
-    assert healed <= first <= healed + 6
+def test_what_is_well_again_is_soon_found(long_drive, wrong):
+    estimator = deepcopy(wrong.before[HEALED])
+    assert Status.VALID in [estimator.solve(task).status for task in long_drive[HEALED : HEALED + 7]]
 
 
-def test_windows_that_no_soil_explains_say_nothing_of_the_sensors(long_drive):
+def test_windows_that_no_soil_explains_say_nothing_of_the_sensors(long_drive, good, wrong):
     """What is learned as noise from them hides a fault of the same size that comes later."""
-    estimator, sound, bad = WindowEstimator(CONFIG), WindowEstimator(CONFIG), 10
-    for i, task in enumerate(long_drive[: bad + 6]):
-        result, expected = estimator.solve(with_draft(task, -1.0 if i < bad else 1.0)), sound.solve(task)
+    estimator = deepcopy(wrong.before[BAD])
+    result, expected = [estimator.solve(task) for task in long_drive[BAD : BAD + 6]][-1], good.results[BAD + 5]
     assert result.status is Status.VALID
     assert result.noise_factors == pytest.approx(expected.noise_factors, rel=0.3)
     assert result.bearing.std < 1.3 * expected.bearing.std
