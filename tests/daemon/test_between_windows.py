@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from fakes import drive_messages, feed_message, in_reverse
+from fakes import drive_messages, fed, feed_message, in_reverse
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -38,23 +38,9 @@ REAR_DRIVEN = reference_configuration(path=REFERENCES["tractor-2wd"])
 TWO_MOTORS = reference_configuration(path=REFERENCES["tractor-axles"])
 
 
-def fed(config, recording, silent: str = "", since: float = np.inf) -> tuple[Intake, float]:
-    """An intake with the frames of a recording, but for one message from a time [s] on, and the time of the last."""
-    database = load_databases(config)
-    intake = Intake(config, database)
-    begin = None
-    for message in frames(recording, config, database):
-        begin = message.timestamp if begin is None else begin
-        name = database.get_message_by_frame_id(message.arbitration_id).name
-        if name != silent or message.timestamp - begin < since:
-            feed_message(intake.admission, message)
-    intake.ingest()
-    return intake, message.timestamp
-
-
 def decided(config, recording):
     """Result of the first window."""
-    intake, last = fed(config, recording)
+    intake, last = fed(config, frames(recording, config))
     return WindowEstimator(config).solve(intake.finish(last)[0])
 
 
@@ -88,7 +74,7 @@ def test_a_window_that_ends_in_reverse_is_judged_so():
 
 
 def test_an_idle_motor_does_not_keep_the_others_from_their_limit():
-    intake, last = fed(TWO_MOTORS, simulate(TWO_MOTORS, excited("loam", 8.0), seed=3))
+    intake, last = fed(TWO_MOTORS, drive_messages(TWO_MOTORS, 8.0))
     torque = dict(zip(intake.rig.wheels, intake.latest(last).moment.torque, strict=True))
     ceiling = tuple(0.9 * torque[w] if w.startswith("R") else 0.0 for w in intake.rig.wheels)
     assert not intake.latest(last).moment.at_limit
@@ -99,9 +85,10 @@ def test_an_idle_motor_does_not_keep_the_others_from_their_limit():
 def test_pitch_in_gaps_is_no_level_ground_between_windows():
     """A pitch sensor that was silent for the last 0.4 s: the slope goes on."""
     recording = simulate(REAR_DRIVEN, replace(excited("loam", 8.0), slope=((0.0, 0.0), (1.0, 0.1))), seed=3)
-    message = REAR_DRIVEN.signals.pitch.signal.partition(".")[0]
-    heard, silent = (fed(REAR_DRIVEN, recording, message, since) for since in (np.inf, 7.55))
-    known, gone = (intake.latest(last) for intake, last in (heard, silent))
+    pitch = load_databases(REAR_DRIVEN).get_message_by_name(REAR_DRIVEN.signals.pitch.signal.partition(".")[0])
+    heard = list(frames(recording, REAR_DRIVEN))
+    silent = [m for m in heard if m.arbitration_id != pitch.frame_id or m.timestamp < heard[0].timestamp + 7.55]
+    known, gone = (intake.latest(last) for intake, last in (fed(REAR_DRIVEN, some) for some in (heard, silent)))
     assert known.pitch == pytest.approx(0.1, abs=0.01)
     assert gone.pitch is None
     assert gone.moment.given == pytest.approx(known.moment.given, abs=300.0)  # the whole slope is 2200 N
@@ -141,8 +128,6 @@ def test_bins_that_leave_too_few_values_are_said_to():
 
 # --- mechanical front-wheel drive: an axle that its clutch has left behind pulls nothing ---
 
-TRUTH = reference_configuration(path=REFERENCES["tractor-2wd"])
-
 
 def with_a_shaft_to_both_axles(lead: float = 1.0):
     """The rear motor as that of both axles, geared so that they turn alike; lead: of the front wheels' rims."""
@@ -159,19 +144,16 @@ def with_a_shaft_to_both_axles(lead: float = 1.0):
 
 def largest_draft(truth, config, seed: int):
     """Of the last window of a drive on loam."""
-    intake = Intake(config, load_databases(config))
-    for message in drive_messages(truth, 14.5, seed):
-        feed_message(intake.admission, message)
-    intake.ingest()
+    intake, last = fed(config, drive_messages(truth, 14.5, seed))
     estimator = WindowEstimator(config)
-    return [estimator.solve(task) for task in intake.finish(message.timestamp)][-1].traversability.max_draft
+    return [estimator.solve(task) for task in intake.finish(last)][-1].traversability.max_draft
 
 
 @cache
 def exact_drafts() -> tuple[float, float]:
     """Largest draft [N] on loam with the rear wheels and with all wheels."""
     soil = Posterior(soil_named("loam"), np.zeros((6, 6)))
-    limits = ((TRUTH, [0.0, 0.0, np.nan, np.nan]), (with_a_shaft_to_both_axles(), [np.nan] * 4))
+    limits = ((REAR_DRIVEN, [0.0, 0.0, np.nan, np.nan]), (with_a_shaft_to_both_axles(), [np.nan] * 4))
     rear, both = (
         assess(soil, rig_of(config), model_of(config), None, np.array(limit), 0.6, 0.5)[0].max_draft.value
         for config, limit in limits
@@ -183,7 +165,7 @@ def exact_drafts() -> tuple[float, float]:
 def test_a_front_axle_that_is_not_engaged_does_not_count_for_the_largest_draft(lead, seed):
     rear, both = exact_drafts()
     assert both > 1.5 * rear
-    found = largest_draft(TRUTH, with_a_shaft_to_both_axles(lead), seed)
+    found = largest_draft(REAR_DRIVEN, with_a_shaft_to_both_axles(lead), seed)
     assert abs(found.value - rear) < 3.0 * np.hypot(found.std, 0.05 * rear)
     assert found.value + 3.0 * found.std < both
 
@@ -197,12 +179,8 @@ def test_an_engaged_front_axle_counts_also_where_its_gear_is_not_known_well(lead
 
 
 def test_a_front_axle_stays_disengaged_while_its_speeds_are_silent():
-    config = with_a_shaft_to_both_axles()
-    intake = Intake(config, load_databases(config))
-    for message in drive_messages(TRUTH, 10.5):
-        feed_message(intake.admission, message)
-    intake.ingest()
-    window, rig = intake.finish(message.timestamp)[0].window, intake.rig
+    intake, last = fed(with_a_shaft_to_both_axles(), drive_messages(REAR_DRIVEN, 10.5))
+    window, rig = intake.finish(last)[0].window, intake.rig
     apart = idle(window, rig, -np.inf, np.zeros(4, bool))
     assert apart.tolist() == rig.front.tolist()
     silent = replace(window, speed=np.where(rig.front, np.nan, window.speed))
@@ -214,7 +192,7 @@ def test_a_disengaged_axle_has_the_rows_of_one_that_is_configured_to_roll_freely
     config = with_a_shaft_to_both_axles()
     wheels = [w.model_copy(update={"driven": w.axle == "rear"}) for w in config.wheel]
     free = config.model_copy(update={"wheel": wheels})
-    channels, soil = simulate(TRUTH, excited("loam", 10.5), 3).channels, soil_named("loam")
+    channels, soil = simulate(REAR_DRIVEN, excited("loam", 10.5), 3).channels, soil_named("loam")
     engaged, configured = rig_of(config), rig_of(free)
     rig = with_disengaged(config, engaged, engaged.front)
     given = completed(bins_of(config, channels).window(0.0, 10.0), engaged)
@@ -234,7 +212,7 @@ def test_each_choice_of_axles_keeps_what_it_has_learned():
     config = with_a_shaft_to_both_axles(1.05)
     intake, estimator = Intake(config, load_databases(config)), WindowEstimator(config)
     trackers, drafts = [], []
-    for part, truth in enumerate((config, TRUTH, config)):
+    for part, truth in enumerate((config, REAR_DRIVEN, config)):
         begin = 0.0
         for message in drive_messages(truth, 18.0, 5 + part):
             begin = begin or message.timestamp

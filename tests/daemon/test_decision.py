@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from driven_windows import task_of, tasks, windows
-from fakes import drive_messages, feed_message
-from soilbus.can.dbc_files import load_databases
+from fakes import drive_messages, fed
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.watch import Watch
@@ -15,7 +14,6 @@ from soilbus.estimation.assembly import effects_of, with_effects
 from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
-from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
@@ -27,10 +25,8 @@ CONFIG = reference_configuration()
 @pytest.fixture(scope="module")
 def drawn_tasks() -> list[WindowTask]:
     """Windows of a good drive, from its frames."""
-    pipeline = Pipeline(CONFIG, load_databases(CONFIG))
-    for message in drive_messages(CONFIG, 16.0):
-        feed_message(pipeline.admission, message)
-    return pipeline.intake.finish(message.timestamp)
+    intake, last = fed(CONFIG, drive_messages(CONFIG, 16.0))
+    return intake.finish(last)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fakes import drive_messages, feed_message, in_reverse
-from soilbus.can.candump import Frame
+from fakes import drive_messages, fed, feed_message, in_reverse
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config, machine, parse_config
 from soilbus.decision.traversability import State, Status, Traversability
@@ -222,42 +221,33 @@ SPEEDS = 0x510
 QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
 
 
-@pytest.fixture(scope="module")
-def loam(field_recording) -> list[Frame]:
-    out = []
-    for frame in read_frames(field_recording("loam.log.gz")):
-        if frame[0] >= START + 14.5:
-            break
-        out.append(frame)
-    return out
-
-
-def spoilt(recorded: list[Frame], share: float = 0.01):
+def spoilt(recorded: Frames, share: float = 0.01):
     """The frames with 1 % of the front left wheel's speeds a tenth too high, and the times of those."""
     rng = np.random.default_rng(1)
     out, times = [], []
-    for t, identifier, extended, data, *rest in recorded:
+    for t, identifier, extended, data in recorded:
         # not where a window's last samples are: one there is counted by the next window
         if identifier == SPEEDS and rng.random() < share and 0.02 < (t - START) % 1.0 < 0.88:
             data = round(1.1 * int.from_bytes(data[:2], "little")).to_bytes(2, "little") + data[2:]
             times.append(t)
-        out.append((t, identifier, extended, data, *rest))
+        out.append((t, identifier, extended, data))
     return out, np.array(times)
 
 
-def windows(recorded: list[Frame]):
+def windows(recorded: Frames):
     """The tasks of the frames, the clock looked at every 200 of them, and the intake."""
     config = load_config(FIELD_TOML)
     intake = Intake(config, load_databases(config))
     tasks = []
-    for i, (t, identifier, extended, data, *_) in enumerate(recorded):
+    for i, frame in enumerate(recorded):
         if i % 200 == 0:
-            tasks += intake.due(t)
-        intake.admission.feed(t, identifier, extended, data)
+            tasks += intake.due(frame[0])
+        intake.admission.feed(*frame)
     return tasks + intake.finish(recorded[-1][0]), intake
 
 
-def test_wild_samples_are_left_out_and_counted(loam):
+def test_wild_samples_are_left_out_and_counted(half_minute):
+    loam = [frame for frame in half_minute if frame[0] < START + 14.5]
     frames_, times = spoilt(loam)
     assert len(times) > 3
     clean, _ = windows(loam)
@@ -281,10 +271,8 @@ def test_a_wheel_without_a_speed_sensor_has_no_slip():
     for wheel in raw["wheel"]:
         del wheel["speed"]
     config = parse_config(raw)
-    intake = Intake(config, load_databases(config))
-    for message in drive_messages(config, 11.5):
-        feed_message(intake.admission, message)
-    slip = intake.finish(message.timestamp)[0].slip
+    intake, last = fed(config, drive_messages(config, 11.5))
+    slip = intake.finish(last)[0].slip
     assert slip["FL"] is None
     assert slip["FR"] is None
     assert slip["RL"] == pytest.approx(slip["RR"])  # that of their motor

@@ -17,6 +17,7 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.offline.played_bus import InlineExecutor, PlayedClock
+from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
@@ -25,8 +26,8 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
 __all__ = [
-    "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "feed_message",
-    "in_reverse",
+    "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "fed",
+    "feed_message", "in_reverse",
 ]  # fmt: skip
 
 FakeClock = PlayedClock
@@ -51,6 +52,16 @@ def feed_message(admission: Admission, message: can.Message) -> None:
     admission.feed(
         message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
     )
+
+
+def fed(config: Config, messages: Iterable[can.Message]) -> tuple[Intake, float]:
+    """An intake that has taken these messages, and the time of the last one [s]."""
+    intake, last = Intake(config, load_databases(config)), 0.0
+    for message in messages:
+        feed_message(intake.admission, message)
+        last = message.timestamp
+    intake.ingest()
+    return intake, last
 
 
 class Notes(Notifier):
