@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fakes import FakeClock
+from fakes import FakeClock, message_of
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
@@ -42,7 +42,7 @@ class Desk:
         now = self.clock.now
         for before in range(5, -1, -1) if name == "Traversability" else (0,):
             self.clock.now = now - 0.1 * before
-            self.known.receive(message(self.publisher.frame(name, values)))
+            self.known.receive(message_of(self.publisher.frame(name, values)))
         self.dashboard.sample()
 
     def send_all(self, **changed) -> None:
@@ -64,10 +64,6 @@ def desk() -> Desk:
 @pytest.fixture
 def setup(desk):
     return desk.publisher, desk.known, desk.clock
-
-
-def message(frame) -> can.Message:
-    return can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
 
 
 WHOLE = {
@@ -352,7 +348,7 @@ def test_without_colour_the_state_stands_there_in_words_and_reverse_video(desk, 
 
 def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
     publisher, dashboard, _ = setup
-    good = message(publisher.frame("Traversability", {"State": "no_go"}))
+    good = message_of(publisher.frame("Traversability", {"State": "no_go"}))
     for bit in range(64):
         bad = bytearray(good.data)
         bad[bit // 8] ^= 1 << bit % 8
@@ -363,7 +359,7 @@ def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
 
 def test_a_frame_of_can_fd_is_never_ours(setup):
     publisher, dashboard, _ = setup
-    frame = message(publisher.frame("Traversability", {"State": "no_go"}))
+    frame = message_of(publisher.frame("Traversability", {"State": "no_go"}))
     frame.is_fd = True
     dashboard.receive(frame)
     assert (dashboard.bad_frames, dashboard.value("Traversability", "State")) == (1, None)
@@ -376,7 +372,7 @@ def test_a_second_sender_is_named_and_nothing_of_its_message_is_shown(desk):
     twin = Publisher(output_database(CONFIG))
     for _ in range(2):
         frame = twin.frame("WheelSlip", {"SlipWheel1": 0.3})
-    desk.known.receive(message(frame))
+    desk.known.receive(message_of(frame))
     assert desk.dashboard.verdict()[:3] == (
         "UNKNOWN", "UNKNOWN: another node sends our frames", "Remove the second soilbus"
     )  # fmt: skip
@@ -389,7 +385,7 @@ def test_a_second_sender_is_named_and_nothing_of_its_message_is_shown(desk):
 
 def test_a_stuck_counter_keeps_nothing_fresh(setup):
     publisher, dashboard, clock = setup
-    stuck, after = (message(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
+    stuck, after = (message_of(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
     for _ in range(10):
         dashboard.receive(stuck)
         clock.now += 0.1
@@ -399,13 +395,13 @@ def test_a_stuck_counter_keeps_nothing_fresh(setup):
     assert dashboard.value("Traversability", "State") == "unknown"
     for _ in range(5):
         clock.now += 0.1
-        dashboard.receive(message(publisher.frame("Traversability", {"State": "go"})))
+        dashboard.receive(message_of(publisher.frame("Traversability", {"State": "go"})))
     assert dashboard.value("Traversability", "State") == "go"
 
 
 def test_not_available_is_shown_as_nothing(setup):
     publisher, dashboard, _ = setup
-    dashboard.receive(message(publisher.frame("WheelSlip", {})))
+    dashboard.receive(message_of(publisher.frame("WheelSlip", {})))
     assert dashboard.value("WheelSlip", "SlipWheel1") is None
 
 
@@ -456,7 +452,7 @@ def test_frames_that_were_moved_to_identifiers_of_11_bits_are_read_under_these_a
     (tmp_path / "moved.dbc").write_text(re.sub(r".*VFrameFormat.*\n", "", text))
     database = output_database(reference_configuration([f'output.dbc="{tmp_path / "moved.dbc"}"']))
     known, publisher = ReceivedFrames(database, FakeClock()), Publisher(database)
-    frame = message(publisher.frame("Traversability", {"State": "no_go"}))
+    frame = message_of(publisher.frame("Traversability", {"State": "no_go"}))
     assert not frame.is_extended_id
     frame.is_extended_id = True
     known.receive(frame)
@@ -536,7 +532,7 @@ def test_what_is_not_vouched_for_is_grey(desk):
 
 
 def test_a_bad_frame_is_counted_on_the_engineers_page(desk):
-    frame = message(desk.publisher.frame("Traversability", {"State": "go"}))
+    frame = message_of(desk.publisher.frame("Traversability", {"State": "go"}))
     frame.data[0] ^= 1
     desk.known.receive(frame)
     assert re.search(r"bad frames +1", desk.text("engineer", (80, 24)))

@@ -10,6 +10,7 @@ import pyarrow.parquet
 import pytest
 
 from balances import missing_pull
+from fakes import message_of
 from soilbus.can.publish import Publisher
 from soilbus.cli.main import main
 from soilbus.config.file import shipped_dbc
@@ -33,8 +34,7 @@ def publisher() -> Publisher:
 
 
 def command_frame(publisher, name="DriveCommand", **values) -> can.Message:
-    frame = publisher.frame(name, values)
-    return can.Message(arbitration_id=frame.arbitration_id, data=frame.data)
+    return message_of(publisher.frame(name, values))
 
 
 def test_frames_in_steps_are_the_frames_at_once():

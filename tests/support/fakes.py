@@ -1,7 +1,7 @@
 """Scripted bus, clock and workers for tests, a service on them, and the frames of a simulated drive."""
 
 import errno
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
@@ -11,7 +11,7 @@ import can
 from soilbus.can.admission import Admission
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
+from soilbus.can.publish import Frame, Publisher
 from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
@@ -27,7 +27,7 @@ from soilbus.simulator.scenario import excited
 
 __all__ = [
     "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "fed",
-    "feed_message", "in_reverse",
+    "feed_message", "in_reverse", "message_of", "sent_by",
 ]  # fmt: skip
 
 FakeClock = PlayedClock
@@ -36,6 +36,16 @@ FakeClock = PlayedClock
 def drive_messages(config: Config, seconds: float, seed: int = 3) -> list[can.Message]:
     """Frames of a good drive on loam: draft swings, slip is what the soil asks for."""
     return list(frames(simulate(config, excited("loam", seconds), seed), config))
+
+
+def message_of(frame: Frame, t: float = 0.0) -> can.Message:
+    """A frame as python-can hands it out, with a stamp [s]."""
+    return can.Message(timestamp=t, arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
+
+
+def sent_by(publisher: Publisher, values: Mapping[str, Mapping[str, Any]], t: float) -> list[can.Message]:
+    """The frames of these messages with these values, all at one time [s]."""
+    return [message_of(publisher.frame(name, of_frame), t) for name, of_frame in values.items()]
 
 
 def in_reverse(recording: Recording) -> Recording:
