@@ -8,14 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.decision.capability import OverSlip
-from soilbus.decision.moments import Moment, Sample
 from soilbus.decision.watch import Alert, Watch, watched
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import REFERENCES, reference_configuration
-from soilbus.terra.vehicle import GRAVITY
 from soilbus.trials import boggings, firm_drives
 from soilbus.trials.bogging_trials import Drive, Task, WarningTrial, figures, trial, warning_trials
-from watched_drives import Observation, judged, observed, watch
+from watched_drives import Observation, judged, look, observed, watch
 
 CONFIG = reference_configuration()
 SLIP = np.linspace(0.02, 0.6, 9)
@@ -38,16 +36,6 @@ def slip_at(pull):
     """The slip that gives a pull; 0.7 where none does."""
     fine = np.linspace(0.0, 0.6, 2000)
     return float(np.interp(pull, np.interp(fine, SLIP, pull_at(SLIP)), fine, left=0.0, right=0.7))
-
-
-def look(t, slip, pull, inertia=0.0):
-    """What a vehicle of 2300 kg at 1 m/s shows at a slip and a pull [N]; None: not known."""
-    known, weight = slip is not None and slip < 1.0, 2300.0 * GRAVITY
-    rim = 1.0 / (1.0 - slip) if known else math.nan
-    given = math.nan if pull is None else pull
-    last = Sample(t, 1.0, 1e-4, rim, 1e-4, given / weight, draft=(given - inertia) / weight)
-    common = slip if known else math.nan
-    return Moment(t, 1.0, [rim] * 4, 0.0, False, last=last, common=common, given=given, inertia=inertia, mass=2300.0)
 
 
 def seen(looks, curve=CURVE):

@@ -23,13 +23,10 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.soils import SOILS
+from wheels_around import active
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
-
-
-def active(name: str, **values: float) -> Active:
-    return Active(CATALOGUE[name], CATALOGUE[name].neutral | values)
 
 
 LOSS, MORE_LOSS, PUSH = (
