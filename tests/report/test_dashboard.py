@@ -61,11 +61,6 @@ def desk() -> Desk:
     return Desk()
 
 
-@pytest.fixture
-def setup(desk):
-    return desk.publisher, desk.known, desk.clock
-
-
 WHOLE = {
     "SoilbusStatus": {"State": "valid", "Reason": "none", "RejectedShare": 2.0, "DeadlineMisses": 4, "Window": 7},
     "SoilbusIdentity": {"VersionMajor": 0, "VersionMinor": 3, "VersionPatch": 1, "Uptime": 5},
@@ -346,23 +341,21 @@ def test_without_colour_the_state_stands_there_in_words_and_reverse_video(desk, 
     assert re.search(r"\x1b\[[\d;]*7m[^\n]*NO-GO", text)
 
 
-def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
-    publisher, dashboard, _ = setup
-    good = message_of(publisher.frame("Traversability", {"State": "no_go"}))
+def test_a_frame_with_one_bit_wrong_is_not_believed(desk):
+    good = message_of(desk.publisher.frame("Traversability", {"State": "no_go"}))
     for bit in range(64):
         bad = bytearray(good.data)
         bad[bit // 8] ^= 1 << bit % 8
-        dashboard.receive(can.Message(arbitration_id=good.arbitration_id, is_extended_id=True, data=bad))
-    assert dashboard.bad_frames == 64
-    assert dashboard.value("Traversability", "State") is None
+        desk.known.receive(can.Message(arbitration_id=good.arbitration_id, is_extended_id=True, data=bad))
+    assert desk.known.bad_frames == 64
+    assert desk.known.value("Traversability", "State") is None
 
 
-def test_a_frame_of_can_fd_is_never_ours(setup):
-    publisher, dashboard, _ = setup
-    frame = message_of(publisher.frame("Traversability", {"State": "no_go"}))
+def test_a_frame_of_can_fd_is_never_ours(desk):
+    frame = message_of(desk.publisher.frame("Traversability", {"State": "no_go"}))
     frame.is_fd = True
-    dashboard.receive(frame)
-    assert (dashboard.bad_frames, dashboard.value("Traversability", "State")) == (1, None)
+    desk.known.receive(frame)
+    assert (desk.known.bad_frames, desk.known.value("Traversability", "State")) == (1, None)
 
 
 def test_a_second_sender_is_named_and_nothing_of_its_message_is_shown(desk):
@@ -383,26 +376,24 @@ def test_a_second_sender_is_named_and_nothing_of_its_message_is_shown(desk):
     assert desk.dashboard.verdict().word == "GO"
 
 
-def test_a_stuck_counter_keeps_nothing_fresh(setup):
-    publisher, dashboard, clock = setup
-    stuck, after = (message_of(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
+def test_a_stuck_counter_keeps_nothing_fresh(desk):
+    stuck, after = (message_of(desk.publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
     for _ in range(10):
-        dashboard.receive(stuck)
-        clock.now += 0.1
-    assert dashboard.bad_frames == 9
-    assert dashboard.value("Traversability", "State") is None
-    dashboard.receive(after)
-    assert dashboard.value("Traversability", "State") == "unknown"
+        desk.known.receive(stuck)
+        desk.clock.now += 0.1
+    assert desk.known.bad_frames == 9
+    assert desk.known.value("Traversability", "State") is None
+    desk.known.receive(after)
+    assert desk.known.value("Traversability", "State") == "unknown"
     for _ in range(5):
-        clock.now += 0.1
-        dashboard.receive(message_of(publisher.frame("Traversability", {"State": "go"})))
-    assert dashboard.value("Traversability", "State") == "go"
+        desk.clock.now += 0.1
+        desk.known.receive(message_of(desk.publisher.frame("Traversability", {"State": "go"})))
+    assert desk.known.value("Traversability", "State") == "go"
 
 
-def test_not_available_is_shown_as_nothing(setup):
-    publisher, dashboard, _ = setup
-    dashboard.receive(message_of(publisher.frame("WheelSlip", {})))
-    assert dashboard.value("WheelSlip", "SlipWheel1") is None
+def test_not_available_is_shown_as_nothing(desk):
+    desk.send("WheelSlip")
+    assert desk.known.value("WheelSlip", "SlipWheel1") is None
 
 
 def test_a_stale_go_is_no_go_any_more(desk):
