@@ -8,9 +8,6 @@ a fault for which the status is not valid.
 
 import json
 import math
-from copy import deepcopy
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +15,7 @@ import numpy as np
 import pytest
 
 import log_edits as le
-from log_edits import Edit, Frame, Log, Stream
+from log_edits import Edit, Log, Stream
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
@@ -58,20 +55,12 @@ class Fault(NamedTuple):
     length: float = LENGTH
 
 
-@dataclass(frozen=True)
-class Drive:
+class Drive(NamedTuple):
     """A good recording with its configuration and the truth: bearing pressure [Pa], tan phi and largest draft [N]."""
 
     config: Config
     log: Log
     truth: tuple[float, float, float]
-
-    @cached_property
-    def begun(self) -> tuple[list[Frame], list[WindowResult], Pipeline]:
-        """The frames before most faults begin, what they gave, and a pipeline that has taken them."""
-        good = [frame for frame in self.log.frames() if frame[0] < FAULT - 0.5]
-        pipeline = Pipeline(self.config, load_databases(self.config))
-        return good, fed(pipeline, good), pipeline
 
 
 def motors(message: str) -> list[str]:
@@ -112,27 +101,18 @@ def clay() -> Drive:
     return simulated(hard, "wet_clay")
 
 
-def fed(pipeline: Pipeline, frames: list[Frame]) -> list[WindowResult]:
-    """The windows that end while a pipeline takes these frames."""
-    results: list[WindowResult] = []
-    for i, frame in enumerate(frames):
-        if i % 400 == 0:
-            results += pipeline.advance(frame[0])
-        pipeline.feed(*frame)
-    return results
-
-
 def run(drive: Drive, edit: Edit, since: float, length: float) -> tuple[list[WindowResult], Pipeline]:
-    """What an edited drive gives; a fault that leaves the beginning alone goes on from there."""
-    whole = Log.of({n: s.before(START + length) for n, s in drive.log.streams.items()})
-    frames = edit(whole, since).frames()
-    good, results, pipeline = drive.begun
-    if frames[: len(good)] == good:
-        pipeline, frames = deepcopy(pipeline), frames[len(good) :]
-    else:
-        results, pipeline = [], Pipeline(drive.config, load_databases(drive.config))
-    results = results + fed(pipeline, frames)
-    return results + pipeline.finish(frames[-1][0]), pipeline
+    log = drive.log
+    whole = Log.of({n: s.before(START + length) for n, s in log.streams.items()})
+    pipeline = Pipeline(drive.config, load_databases(drive.config))
+    results: list[WindowResult] = []
+    now = 0.0
+    for i, frame in enumerate(edit(whole, since).frames()):
+        now = frame[0]
+        if i % 400 == 0:
+            results += pipeline.advance(now)
+        pipeline.feed(*frame)
+    return results + pipeline.finish(now), pipeline
 
 
 def deviations(result: WindowResult, truth: tuple[float, float, float]) -> list[float]:
