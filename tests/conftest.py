@@ -1,12 +1,10 @@
 """Fixtures of all tests."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from xdist.scheduler import LoadFileScheduling
 import guest
 import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
+from soilbus.allocator import loading
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/cli/test_demo.py")
@@ -26,6 +25,13 @@ IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/cli/test_
 hypothesis.settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("seeded")
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # below nohup it is ignored, also by the processes that tests start
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Look for no garbage while tests are collected, nor later among what that has made: it took half of the time."""
+    with loading():
+        return (yield)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,8 +4,6 @@ Prints for each mutation whether it was killed; exit code 1 if one survived, if 
 list must then be mended), or if its tests fail without it.  With words, only mutations whose names hold one of them.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

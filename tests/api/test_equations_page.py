@@ -1,7 +1,5 @@
 """The page of equations: each names its module and its source, and every effect of the catalogue has its row."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

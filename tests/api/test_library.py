@@ -1,7 +1,5 @@
 """`import soilbus`: what it loads, and what each function of the library answers."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -21,8 +19,8 @@ from soilbus.offline.columns import TableError
 from soilbus.offline.replay import LogError
 from soilbus.simulator.reference import TRACTOR
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Active
 from soilbus.terra.soils import SOILS
+from wheels_around import active
 
 TRUTH = soilbus.Soil(k_c=2e3, k_phi=1.5e6, n=0.8, phi=0.5, c=2e3, K=0.015)
 ROLES = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage")
@@ -142,9 +140,8 @@ def test_load_and_sinkage_are_each_others_inverse_in_any_shape():
 
 @pytest.mark.parametrize(("name", "value"), [("slip_sinkage", 0.5), ("lugs", 0.02), ("hardpan", 3.0)])
 def test_effects_act_as_in_the_catalogue(name, value):
-    effect = CATALOGUE[name]
-    active = Active(effect, effect.neutral | {effect.parameters[0].name: value})
-    wanted = sweep(TRUTH, (800.0, 1500.0), (0.05, 0.3, 0.6), [active])
+    first = CATALOGUE[name].parameters[0].name
+    wanted = sweep(TRUTH, (800.0, 1500.0), (0.05, 0.3, 0.6), [active(name, **{first: value})])
     found = soilbus.wheel_forces(
         TRUTH, wanted["load"], wanted["slip"], radius=RADIUS, width=WIDTH, effects={name: value}
     )
@@ -257,6 +254,7 @@ def test_each_soil_bed_has_its_own_estimate(columns):
     ("change", "more", "error", "complaint"),
     [
         ({"wheel_load": None}, {}, TableError, "no column wheel_load; it has slip"),
+        (dict.fromkeys(ROLES), {}, TableError, "no column wheel_load"),
         ({"torque": None, "torqe": [1.0] * 18}, {}, TableError, "torqe; did you mean torque"),
         ({"torque": [1.0]}, {}, TableError, "not of one length"),
         ({"torque": 1.0}, {}, TableError, "not of one length"),
@@ -272,11 +270,6 @@ def test_wrong_data_or_a_wrong_rig_is_refused_in_a_line(columns, change, more, e
     with pytest.raises(error, match=complaint) as refused:
         soilbus.estimate(data, soilbus.SingleWheelRig(**{"radius": RADIUS, "width": WIDTH} | more))
     assert "\n" not in str(refused.value)
-
-
-def test_a_table_without_columns_names_those_that_are_needed():
-    with pytest.raises(TableError, match="no column wheel_load"):
-        soilbus.estimate({}, soilbus.SingleWheelRig(RADIUS, WIDTH))
 
 
 def test_replay_is_the_json_lines_as_a_table(tmp_path, drive):

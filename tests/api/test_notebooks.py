@@ -1,7 +1,5 @@
 """The notebooks run from the first cell to the last, and show what their text says."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

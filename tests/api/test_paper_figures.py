@@ -1,7 +1,5 @@
 """Figures of the paper against a second wheel formula, figures that we know of the paper, and its own claims."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

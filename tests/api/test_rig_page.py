@@ -1,7 +1,5 @@
 """The page of test-rig tables: its files, commands and Python run as written and print what it says."""
 
-from __future__ import annotations
-
 import doctest
 import re
 import shlex

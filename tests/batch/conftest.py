@@ -1,7 +1,5 @@
 """Logs of two vehicles, some of them broken, and a Dask cluster within the process."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,11 +8,9 @@ from typing import Any
 
 import pytest
 
+from fakes import drive_messages
 from soilbus.can.log_writer import write_log
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from soilbus.simulator.scenario import excited
 
 SHORT = "estimator.window=4"
 
@@ -24,7 +20,7 @@ def drive(tmp_path_factory) -> list[str]:
     """Lines of a log of nine seconds, from 14 November 2023 22:13:20 UTC on."""
     config = reference_configuration([SHORT])
     path = tmp_path_factory.mktemp("drive") / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 9.0), seed=4), config), path)
+    write_log(drive_messages(config, 9.0, seed=4), path)
     return path.read_text().splitlines(keepends=True)
 
 

@@ -1,7 +1,5 @@
 """A batch: every log is done or named, what was done stays done, and other programs read the results."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Workers that are processes of their own and see none of the batch's files: DBCs come to them, logs by URL."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A batch whose processes are killed, none of which another user can reach, and the memory that a long log takes."""
 
-from __future__ import annotations
-
 import glob
 import os
 import re

@@ -1,7 +1,5 @@
 """A batch on this machine: a process that dies costs its own task alone, and the results are those of a cluster."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat

@@ -1,7 +1,5 @@
 """What the arguments of a batch name: manifests of all kinds, folders with anything in them, archives and servers."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The folder of results: one batch at a time, nobody else's files, nothing of earlier arguments left in it."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 

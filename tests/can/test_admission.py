@@ -1,7 +1,5 @@
 """Which frames count, and what each refusal is called."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Error frames as drivers build them, and what the service makes of them."""
 
-from __future__ import annotations
-
 import can
 import pytest
 

@@ -1,7 +1,5 @@
 """Our reading of candump lines against python-can's, line for line."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """CRC-8 SAE J1850 and the checksum of a frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """A DBC without what nobody maps says the same of what somebody does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The column decoder against cantools, bit for bit."""
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path
@@ -161,7 +159,6 @@ def test_scaled_multiplexer_selects_by_its_physical_value() -> None:
     assert_equal_to_cantools(message, [b"\x02\x11", b"\x04\x11"])
     payload = as_column([b"\x02\x11", b"\x04\x11"], 2)
     present = ColumnDecoder(message, ["Child"]).columns(payload)["Child"].present
-    assert present is not None
     assert present.tolist() == [True, False]
 
 

@@ -1,7 +1,5 @@
 """Parameter groups of identifiers, against the standard's own numbers (SAE J1939-21, ISO 11783-3)."""
 
-from __future__ import annotations
-
 import pytest
 
 from soilbus.can.j1939 import group_mask, pgn_of, source_of

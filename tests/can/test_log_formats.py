@@ -1,7 +1,5 @@
 """One drive in the formats in which people have their logs: each gives the same frames, or a reason."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import json
@@ -155,15 +153,7 @@ def test_what_python_can_writes_gives_the_frames(kind: str, tmp_path: Path) -> N
     path = tmp_path / f"drive{kind}"
     with can.Logger(path) as log:
         for t, identifier, data in FRAMES:
-            log(
-                can.Message(
-                    timestamp=t,
-                    arbitration_id=int(identifier, 16),
-                    is_extended_id=is_extended(identifier),
-                    data=data,
-                    channel=0,
-                )
-            )
+            log(can.Message(t, int(identifier, 16), is_extended(identifier), data=data, channel=0))
     check_same(Log(path, "can0"), 1e-5)
 
 

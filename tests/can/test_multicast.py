@@ -1,7 +1,5 @@
 """Buses between processes without SocketCAN: multicast groups, where a sender hears itself."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

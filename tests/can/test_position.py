@@ -1,7 +1,5 @@
 """Positions on the bus: mapping, units, time-outs, and the two standard frames from any source."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The limits of a log that is made to fill memory or time, and the channel whose frames are read."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma
@@ -10,7 +8,8 @@ import subprocess
 import sys
 import tracemalloc
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import can
@@ -27,6 +26,17 @@ from soilbus.simulator.reference import reference_configuration
 
 LINE = b"(1700000000.000000) can0 123#0011223344556677\n"
 BLANKS = b" " * 60_000 + b"\n"
+
+
+@contextmanager
+def memory_below(mebibytes: int) -> Iterator[None]:
+    """Fail where what is done in it takes more memory at any time."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < mebibytes * 2**20
+    finally:
+        tracemalloc.stop()
 
 
 def packed_lines(pack: Callable[..., object]) -> Callable[[Path], None]:
@@ -75,14 +85,9 @@ def test_a_small_log_that_unpacks_to_much_is_refused_in_little_memory(
     path = tmp_path / "bomb"
     write(path)
     n = 0
-    tracemalloc.start()
-    try:
-        with pytest.raises(LogError, match=reason):
-            for n, _ in enumerate(Log(path).frames(), 1):  # noqa: B007
-                pass
-        assert tracemalloc.get_traced_memory()[1] < 150 * 2**20
-    finally:
-        tracemalloc.stop()
+    with memory_below(150), pytest.raises(LogError, match=reason):
+        for n, _ in enumerate(Log(path).frames(), 1):  # noqa: B007
+            pass
     assert n >= 1
 
 
@@ -96,13 +101,8 @@ def test_an_mf4_of_blocks_that_unpack_to_much_is_refused(
     block = b"##DZ" + struct.pack("<4xQQ", 48 + len(packed), 0) + b"DT\0\0" + lengths + packed
     path = tmp_path / "bomb.mf4"
     path.write_bytes(b"MDF     4.10    soilbus " + bytes(40) + block * blocks)
-    tracemalloc.start()
-    try:
-        with pytest.raises(LogError, match=reason):
-            list(Log(path).frames())
-        assert tracemalloc.get_traced_memory()[1] < 150 * 2**20
-    finally:
-        tracemalloc.stop()
+    with memory_below(150), pytest.raises(LogError, match=reason):
+        list(Log(path).frames())
 
 
 def test_a_log_of_constant_data_is_no_bomb(tmp_path: Path) -> None:
@@ -126,13 +126,8 @@ def test_a_line_without_end_is_damage_and_takes_no_memory(kind: str, tmp_path: P
         for _ in range(64):
             file.write(b"0" * 2**20)
     before: list[object] = []
-    tracemalloc.start()
-    try:
-        with pytest.raises(LogError, match=r"a line of more than \d+ characters"):
-            before.extend(read_frames(path))
-        assert tracemalloc.get_traced_memory()[1] < 8 * 2**20
-    finally:
-        tracemalloc.stop()
+    with memory_below(8), pytest.raises(LogError, match=r"a line of more than \d+ characters"):
+        before.extend(read_frames(path))
     assert len(before) == 300
 
 
@@ -150,13 +145,8 @@ def test_ranges_of_a_multiplexer_are_counted_not_expanded(tmp_path: Path) -> Non
     config = parse_config({"dbc": {"input": [str(path)]}})
     for ranges in ("0-4294967295", "0-99999, 100000 - 300000", "0-9" + "9" * 5000):
         path.write_text(MUX.format(ranges=ranges))
-        tracemalloc.start()
-        try:
-            with pytest.raises(ConfigError, match=r"SG_MUL_VAL_ of Speed: .*more than 262144 values"):
-                load_databases(config)
-            assert tracemalloc.get_traced_memory()[1] < 64 * 2**20
-        finally:
-            tracemalloc.stop()
+        with memory_below(64), pytest.raises(ConfigError, match=r"SG_MUL_VAL_ of Speed: .*more than 262144 values"):
+            load_databases(config)
     path.write_text(MUX.format(ranges="1-3, 7-7, 200-255"))
     speed = load_databases(config).get_message_by_name("M").get_signal_by_name("Speed")
     assert speed.multiplexer_ids == [1, 2, 3, 7, *range(200, 256)]

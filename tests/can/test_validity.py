@@ -1,7 +1,5 @@
 """Which codes are values: J1939 bands, value tables, ranges, validity signals."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The kernel's frames as python-can reads them; a datagram socket stands in for the CAN socket where it can."""
 
-from __future__ import annotations
-
 import errno
 import math
 import socket

@@ -1,7 +1,5 @@
 """What is free goes back to the kernel when asked, and stays till then; each in a process of its own."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

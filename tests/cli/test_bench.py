@@ -1,7 +1,5 @@
 """`soilbus bench`: every figure beside its target, the same problem for ours and the peer, faults in one line."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import sys

@@ -1,7 +1,5 @@
 """Commands as a user types them: exit codes, one line for each fault, nothing half-written."""
 
-from __future__ import annotations
-
 import errno
 import gzip
 import itertools
@@ -45,6 +43,13 @@ def lines(capsys) -> tuple[list[str], list[str]]:
     return out.splitlines(), err.splitlines()
 
 
+def only_complaint(capsys) -> str:
+    """The one line that a command has said, which is of a fault."""
+    printed, err = lines(capsys)
+    assert (printed, len(err)) == ([], 1)
+    return err[0]
+
+
 def test_replay_of_a_simulated_drive_finds_the_soil(log, tractor, tmp_path, capsys):
     out = tmp_path / "out.jsonl"
     assert main(["replay", "--config", str(tractor), str(log), "--json", str(out)]) == 0
@@ -68,18 +73,16 @@ def test_json_to_stdout_is_nothing_but_json(log, tractor, capsys):
 
 def broken(kind: str, log: Path, to: Path) -> Path:
     data = log.read_bytes()
-    if kind == "midway.log":
-        (to / kind).write_bytes(data[: len(data) * 9 // 10 + 7])
-    elif kind == "midway.log.gz":
-        (to / kind).write_bytes(gzip.compress(data)[: len(data) // 8])
-    elif kind == "random.blf":
-        (to / kind).write_bytes(np.random.default_rng(1).bytes(4000))
-    elif kind == "words.log":
-        (to / kind).write_text("the quick brown fox\n")
-    elif kind == "empty.log":
-        (to / kind).write_text("")
-    elif kind == "other_bus.log":
-        (to / kind).write_text("".join(f"(1700000000.{i:06d}) can0 7{i % 256:02X}#00\n" for i in range(500)))
+    contents = {
+        "midway.log": data[: len(data) * 9 // 10 + 7],
+        "midway.log.gz": gzip.compress(data)[: len(data) // 8],
+        "random.blf": np.random.default_rng(1).bytes(4000),
+        "words.log": b"the quick brown fox\n",
+        "empty.log": b"",
+        "other_bus.log": b"".join(b"(1700000000.%06d) can0 7%02X#00\n" % (i, i % 256) for i in range(500)),
+    }
+    if kind in contents:
+        (to / kind).write_bytes(contents[kind])
     return to / kind
 
 
@@ -92,11 +95,9 @@ def test_a_bad_log_is_one_line_and_leaves_no_file(kind, log, tractor, tmp_path, 
     path = broken(kind, log, tmp_path)
     capsys.readouterr()
     assert main(["replay", "--config", str(tractor), str(path), "--json", str(out)]) == 1
-    printed, err = lines(capsys)
-    assert len(err) == 1
-    assert str(path) in err[0]
-    assert "Traceback" not in err[0]
-    assert printed == []
+    said = only_complaint(capsys)
+    assert str(path) in said
+    assert "Traceback" not in said
     assert [p.name for p in tmp_path.iterdir() if "jsonl" in p.name] == []
 
 
@@ -137,11 +138,9 @@ def test_a_value_that_no_parser_bears_is_one_line_and_exit_code_2(value, tmp_pat
     (tmp_path / "c.toml").write_text(f"x = {value}\n")
     for words in (["--config", str(tmp_path / "c.toml")], ["--config", str(FIELD), "--set", f"vehicle.mass={value}"]):
         assert main(["check", *words]) == 2
-        printed, err = lines(capsys)
-        assert printed == []
-        assert len(err) == 1
-        assert len(err[0]) < 250
-        assert "too deeply" in err[0] or "too many digits" in err[0]
+        said = only_complaint(capsys)
+        assert len(said) < 250
+        assert "too deeply" in said or "too many digits" in said
 
 
 @pytest.mark.parametrize("kind", ["pipe", "endless", "folder", "large"])
@@ -157,11 +156,9 @@ def test_a_dbc_that_is_no_regular_file_is_one_line_and_exit_code_2(kind, tmp_pat
     for key in ("dbc.input", "output.dbc"):
         value = f'["{name}"]' if key == "dbc.input" else f'"{name}"'
         assert main(["check", "--config", str(FIELD), "--set", f"{key}={value}"]) == 2
-        printed, err = lines(capsys)
-        assert printed == []
-        assert len(err) == 1
-        assert key in err[0]
-        assert any(why in err[0] for why in ("not a regular file", "larger than", "directory"))
+        said = only_complaint(capsys)
+        assert key in said
+        assert any(why in said for why in ("not a regular file", "larger than", "directory"))
 
 
 @pytest.mark.parametrize(
@@ -175,10 +172,7 @@ def test_a_damaged_sqlite_log_is_cut_off_where_it_is_damaged(column, value, log,
     with closing(sqlite3.connect(path)) as base, base:
         base.execute(f"UPDATE messages SET {column} = ? WHERE rowid = 300", [value])
     assert main(["replay", "--config", str(tractor), str(path)]) == 1
-    printed, err = lines(capsys)
-    assert printed == []
-    assert len(err) == 1
-    assert f"{path}: cut off or damaged after 299 frames" in err[0]
+    assert f"{path}: cut off or damaged after 299 frames" in only_complaint(capsys)
 
 
 @pytest.mark.parametrize(
@@ -220,9 +214,7 @@ def test_the_folder_is_no_key_of_the_file(tmp_path):
 def test_a_bus_that_does_not_exist_is_one_line(interface, tractor, capsys):
     settings = ["--set", f"bus.interface={interface}", "--set", "bus.channel=nope7"]
     assert main(["run", "--config", str(tractor), *settings]) == 1
-    err = lines(capsys)[1]
-    assert len(err) == 1
-    assert "nope7" in err[0]
+    assert "nope7" in only_complaint(capsys)
 
 
 def test_simulate_refuses_an_unknown_soil_and_an_unwritable_place(tmp_path, capsys):
@@ -286,11 +278,9 @@ def test_a_bus_that_goes_away_ends_simulate_with_one_line(tractor, capsys, monke
     monkeypatch.setattr(VirtualBus, "send", send)
     settings = ["--set", "bus.interface=virtual", "--set", "bus.channel=gone"]
     assert main(["simulate", "--config", str(tractor), *settings, "--duration", "3", "--bus"]) == 1
-    out, err = lines(capsys)
-    assert out == []
-    assert len(err) == 1
-    assert "virtual:gone" in err[0]
-    assert "Network is down" in err[0]
+    said = only_complaint(capsys)
+    assert "virtual:gone" in said
+    assert "Network is down" in said
 
 
 @pytest.mark.parametrize("option", ["--json", "--report", "--frames", "--table"])

@@ -1,7 +1,5 @@
 """The newcomer's first minute."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

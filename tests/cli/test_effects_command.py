@@ -1,7 +1,5 @@
 """`soilbus effects`: all that the catalogue knows, as text and as JSON."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """The help of each command ends with a line that the command line takes; a shell completes commands and options."""
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 from pathlib import Path

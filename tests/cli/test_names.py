@@ -3,8 +3,6 @@
 Each output is read by the parser of its own format.  A name is one line at most, and nothing in it acts.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

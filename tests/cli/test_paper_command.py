@@ -1,7 +1,5 @@
 """`soilbus paper` as a reader sees it."""
 
-from __future__ import annotations
-
 import io
 import re
 from contextlib import redirect_stdout

@@ -1,7 +1,5 @@
 """The program as a process: signals, standard streams, files that are left, workers that are left."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Our source address on a bus with others that want it: can-j1939 as claimant on the same virtual bus."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 

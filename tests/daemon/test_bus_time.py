@@ -1,7 +1,5 @@
 """The bus's own time, and when a window's end is heard."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Readers judge silence by the DBC's cycle times: soilbus sends no frame less often than its DBC promises."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,8 +1,7 @@
 """GO ends with the facts: frames of drives that end stuck in, frames and windows out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import replace
 
 import can
@@ -154,9 +153,13 @@ BO_ 2566865920 MotorLimits: 8 Tractor
 """
 
 
+DERATES, SILENT, LIFTED = 13.0, 15.0, 28.0
+"""Seconds after which all motors derate, no limit is heard of, and the full one is again."""
+
+
 @pytest.fixture(scope="module")
 def limits_apart(tmp_path_factory):
-    """The reference tractor with the limits of its motors in a frame of their own, and its database."""
+    """The reference tractor with its motors' limits in a frame of their own, its database, and frames of a drive."""
     names = [w.name for w in CONFIG.wheel]
     signals = [f' SG_ {w} : {16 * i}|16@1+ (0.05,0) [0|3212.75] "N.m" Service' for i, w in enumerate(names)]
     values = [f'VAL_ 2566865920 {w} 65279 "error" 65535 "not_available" ;' for w in names]
@@ -165,7 +168,12 @@ def limits_apart(tmp_path_factory):
     config = reference_configuration(
         [f'dbc.input=["tractor.dbc", "{path}"]', *(f'wheel.{w}.torque_limit="MotorLimits.{w}"' for w in names)]
     )
-    return config, load_databases(config)
+    database, done = load_databases(config), driven(config, 41, 34.0, None)
+    t = done.columns["t"]
+    limit = np.where((t > DERATES) & (t < LIFTED), 100.0, 2400.0)
+    done = replace(done, columns=done.columns | {f"torque_limit.{w.name}": limit for w in config.wheel})
+    recording = Recording(done.columns, measure(done, config, 41), 41)
+    return config, database, list(frames(recording, config, database, start=0.0))
 
 
 @pytest.mark.parametrize(
@@ -173,28 +181,21 @@ def limits_apart(tmp_path_factory):
     ids=["not available", "error, clock set", "no frame, clock set"],
 )  # fmt: skip
 def test_a_torque_limit_holds_until_another_one_is_reported(limits_apart, lost, clock):
-    # All motors derate after 13 s; from 15 s on no limit is heard of; at 28 s the full one is.
-    config, database = limits_apart
-    derates, silent, lifted = 13.0, 15.0, 28.0
-    done = driven(config, 41, 34.0, None)
-    t = done.columns["t"]
-    limit = np.where((t > derates) & (t < lifted), 100.0, 2400.0)
-    done = replace(done, columns=done.columns | {f"torque_limit.{w.name}": limit for w in config.wheel})
+    config, database, whole = limits_apart
     messages = []
-    recording = Recording(done.columns, measure(done, config, 41), 41)
-    for m in frames(recording, config, database, start=0.0):
-        if m.arbitration_id == LIMITS_ID and silent < m.timestamp < lifted:
+    for m in map(copy, whole):
+        if m.arbitration_id == LIMITS_ID and SILENT < m.timestamp < LIFTED:
             if lost is None:
                 continue
-            m.data[:] = 4 * lost
-        m.timestamp += 1.7e9 + (clock if m.timestamp > silent + 0.5 else 0.0)
+            m.data = 4 * lost
+        m.timestamp += 1.7e9 + (clock if m.timestamp > SILENT + 0.5 else 0.0)
         messages.append(m)
     results = [(r.t - 1.7e9 - (clock if r.t < 1.7e9 else 0.0), r) for r in replayed(messages, config, database)]
     go = [t for t, r in results if r.traversability.state is State.GO]
-    assert any(t < derates for t in go)
-    assert not [t for t in go if derates + 0.5 < t < lifted]
-    assert any(t > lifted + 2.5 for t in go)
-    held = [r.traversability for t, r in results if derates + 0.5 < t < lifted and r.status is Status.VALID]
+    assert any(t < DERATES for t in go)
+    assert not [t for t in go if DERATES + 0.5 < t < LIFTED]
+    assert any(t > LIFTED + 2.5 for t in go)
+    held = [r.traversability for t, r in results if DERATES + 0.5 < t < LIFTED and r.status is Status.VALID]
     assert len(held) >= 3
     assert {way.state for way in held} == {State.NO_GO}
     assert [way.torque_available for way in held] == pytest.approx([400.0] * len(held), rel=5e-3)

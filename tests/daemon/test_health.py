@@ -1,7 +1,5 @@
 """What systemd's watchdog hears: that the service works, and nothing while it does not."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import logging

@@ -6,8 +6,6 @@ window must have.  Of every row holds besides: a window that calls itself valid 
 a fault for which the status is not valid.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -118,9 +116,6 @@ def run(drive: Drive, edit: Edit, since: float, length: float) -> tuple[list[Win
 
 
 def deviations(result: WindowResult, truth: tuple[float, float, float]) -> list[float]:
-    assert result.posterior is not None
-    assert result.bearing is not None
-    assert result.traversability.max_draft is not None
     told = result.bearing, result.posterior.tan_phi(), result.traversability.max_draft
     return [abs(e.value - value) / e.std for e, value in zip(told, truth, strict=True)]
 

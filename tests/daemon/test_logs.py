@@ -1,7 +1,5 @@
 """Several logs: each is a recording of its own, nothing of any is lost, and what is damaged takes nothing with it."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re
@@ -14,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fakes import drive_messages
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
@@ -26,10 +25,7 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.replay_pictures import stretches
 from soilbus.report.windows import summary
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from soilbus.simulator.scenario import excited
 
 WINDOW, SECONDS = 4.0, 9.0
 SHORT = [f"estimator.window={WINDOW}"]
@@ -41,7 +37,7 @@ START = 1_700_000_000.0
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory) -> list[str]:
     path = tmp_path_factory.mktemp("log") / "drive.log"
-    write_log(frames(simulate(CONFIG, excited("loam", SECONDS), seed=4), CONFIG), path)
+    write_log(drive_messages(CONFIG, SECONDS, seed=4), path)
     return path.read_text().splitlines(keepends=True)
 
 

@@ -1,7 +1,5 @@
 """The loop with a clock and a bus in hand: what it sends, when, and that it fails safe."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import math
@@ -13,7 +11,7 @@ from typing import ClassVar
 import can
 import pytest
 
-from fakes import Bench, FakeClock, ScriptedBus, drive_messages
+from fakes import Bench, FakeClock, ScriptedBus, drive_messages, sent_by
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.can.wire import MessageWire
@@ -310,8 +308,7 @@ def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(rec
     ours = Publisher(output_database(CONFIG))
     forged = []
     for i in range(5):
-        frame, at = ours.frame("Traversability", {"State": "go"}), begin + 2.0 + 0.1 * i
-        forged.append(can.Message(timestamp=at, arbitration_id=frame.arbitration_id, data=frame.data))
+        forged += sent_by(ours, {"Traversability": {"State": "go"}}, begin + 2.0 + 0.1 * i)
     bench = Bench(sorted([*recording, *forged], key=lambda m: m.timestamp), CONFIG)
     start = bench.clock.now
     bench.run(DURATION)

@@ -1,20 +1,27 @@
-"""The recordings of the field vehicle, whole and mutilated, through the pipeline."""
-
-from __future__ import annotations
+"""The recordings of the field vehicle, whole and mutilated, through the pipeline, and the keys of its JSON lines."""
 
 import json
 import math
+import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fakes import drive_messages, fed, feed_message, in_reverse
 from soilbus.can.dbc_files import load_databases
-from soilbus.config.file import load_config
-from soilbus.decision.traversability import State, Status
+from soilbus.config.file import load_config, machine, parse_config
+from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.offline.replay import read_frames
+from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.outputs import json_line
 from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
 
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 CLAY = ["soil.c.value=5000", "soil.c.std=1250", "soil.K.value=0.01", "soil.K.std=0.0025"]
@@ -206,3 +213,104 @@ def test_spinning_on_the_spot_is_no_go(half_minute):
     assert len(stuck) >= 14
     assert {r.traversability.state for r in stuck} == {State.NO_GO}
     assert {r.status for r in stuck} <= {Status.NOT_EXCITED, Status.INVALID}
+
+
+# --- Wild samples and reversing, from frames to windows ---
+
+SPEEDS = 0x510
+QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
+
+
+def spoilt(recorded: Frames, share: float = 0.01):
+    """The frames with 1 % of the front left wheel's speeds a tenth too high, and the times of those."""
+    rng = np.random.default_rng(1)
+    out, times = [], []
+    for t, identifier, extended, data in recorded:
+        # not where a window's last samples are: one there is counted by the next window
+        if identifier == SPEEDS and rng.random() < share and 0.02 < (t - START) % 1.0 < 0.88:
+            data = round(1.1 * int.from_bytes(data[:2], "little")).to_bytes(2, "little") + data[2:]
+            times.append(t)
+        out.append((t, identifier, extended, data))
+    return out, np.array(times)
+
+
+def windows(recorded: Frames):
+    """The tasks of the frames, the clock looked at every 200 of them, and the intake."""
+    config = load_config(FIELD_TOML)
+    intake = Intake(config, load_databases(config))
+    tasks = []
+    for i, frame in enumerate(recorded):
+        if i % 200 == 0:
+            tasks += intake.due(frame[0])
+        intake.admission.feed(*frame)
+    return tasks + intake.finish(recorded[-1][0]), intake
+
+
+def test_wild_samples_are_left_out_and_counted(half_minute):
+    loam = [frame for frame in half_minute if frame[0] < START + 14.5]
+    frames_, times = spoilt(loam)
+    assert len(times) > 3
+    clean, _ = windows(loam)
+    tasks, intake = windows(frames_)
+    assert len(tasks) == len(clean) == 5
+    assert intake.refusals.total["outlier"] == np.count_nonzero(times < tasks[-1].end)
+    for task, other in zip(tasks, clean, strict=True):
+        n = np.count_nonzero((times >= task.start) & (times < task.end))
+        assert n > 0
+        assert task.rejected == {"outlier": n}
+        assert other.rejected == {}
+        assert task.window.samples == other.window.samples - n
+        assert task.window.speed[:, 0] == pytest.approx(other.window.speed[:, 0], rel=5e-3)  # 5 sd of a bin's mean
+        for name in QUANTITIES:
+            a, b = getattr(task.window, name), getattr(other.window, name)
+            assert name == "speed" or np.array_equal(a, b, equal_nan=True)
+
+
+def test_a_wheel_without_a_speed_sensor_has_no_slip():
+    raw = tomllib.loads(machine("tractor-2wd").read_text())
+    for wheel in raw["wheel"]:
+        del wheel["speed"]
+    config = parse_config(raw)
+    intake, last = fed(config, drive_messages(config, 11.5))
+    slip = intake.finish(last)[0].slip
+    assert slip["FL"] is None
+    assert slip["FR"] is None
+    assert slip["RL"] == pytest.approx(slip["RR"])  # that of their motor
+    assert 0.05 < slip["RL"] < 0.5
+
+
+def test_slip_in_reverse_is_that_of_the_same_drive_forward():
+    config = reference_configuration()
+    database, recording = load_databases(config), simulate(config, excited("loam", 11.5), seed=3)
+    slips = []
+    for driven in (recording, in_reverse(recording)):
+        intake, tasks = Intake(config, database), []
+        for m in frames(driven, config, database):
+            tasks += intake.due(m.timestamp)
+            feed_message(intake.admission, m)
+        intake.ingest()
+        slips.append([*tasks[0].slip.values(), *intake.latest(m.timestamp).slip.values()])
+    ahead, back = slips
+    assert all(0.0 < s < 0.5 for s in ahead)
+    assert back == pytest.approx(ahead, abs=1e-3)  # codes are rounded
+
+
+# --- The page's table of JSON keys is the table of the keys that a line has ---
+
+DOCS = Path(__file__).resolve().parents[2] / "service" / "docs"
+NOTHING = WindowResult(1.0, 0, Status.INVALID, "no_convergence", None, None, {}, {}, Traversability(), None, 0, {})
+
+
+def test_the_readme_names_every_key_of_a_line():
+    table = re.search(
+        r"^\| key \| meaning \|\n.*\n((?:\|.*\n)+)", (DOCS / "json.md").read_text(encoding="utf-8"), re.M
+    )[1]
+    named = [key for row in table.splitlines() for key in re.findall(r"`(\w+)`", row.split("|")[1])]
+    assert sorted(named) == sorted(json.loads(json_line(NOTHING, reference_configuration())))
+
+
+def test_the_readme_gives_the_drift_of_the_soil_that_is_in_force():
+    (said,) = re.findall(
+        r"`estimator\.soil_drift`, ([\d.]+) in the time of one window", (DOCS / "method.md").read_text(encoding="utf-8")
+    )
+    assert float(said) == reference_configuration().estimator.soil_drift

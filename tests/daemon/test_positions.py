@@ -1,7 +1,5 @@
 """From fixes to positions: noise, gaps, the antimeridian, receivers without a fix."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reading logs: the fast way tells the same as python-can's, also of logs that are damaged."""
 
-from __future__ import annotations
-
 import gc
 import math
 import re

@@ -1,7 +1,5 @@
 """A second sender of an input and wrong checksums: what the service and `check --log` say of them."""
 
-from __future__ import annotations
-
 import copy
 import json
 import re

@@ -1,7 +1,5 @@
 """`soilbus replay --frames`: our frames beside a recording are those that the live service sends."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections import defaultdict

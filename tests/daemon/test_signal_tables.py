@@ -1,7 +1,5 @@
 """Tables of decoded signals: the same windows as the log that they were decoded from, by an independent decoder."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -47,9 +45,7 @@ def folder(tmp_path_factory) -> Path:
     for (message, signal), column in names.items():
         text = text.replace(f'"{message}.{signal}"', f'"{column}"')
     text = text.replace("[dbc]", '[columns]\ntime = "time [s]"')
-    text = re.sub(r"valid = \"[^\"]*\",? ?|(?m:^input = .*$)", "", text).replace(
-        "[dbc]", '[columns]\ntime = "time [s]"'
-    )
+    text = re.sub(r"valid = \"[^\"]*\",? ?|(?m:^input = .*$)", "", text)
     (folder / "table.toml").write_text(text)
     return folder
 

@@ -1,7 +1,5 @@
 """When the state is stored, what it costs the loop, and what the next run makes of it."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections import Counter

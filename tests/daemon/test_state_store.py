@@ -1,7 +1,5 @@
 """The stored state: bit for bit what was known, or one line on why not."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import itertools

@@ -1,7 +1,5 @@
 """The ticks of the ten-hertz frames fall into step with the windows."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """The first windows are rehearsed where nothing depends on them, and nothing of it is left behind."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

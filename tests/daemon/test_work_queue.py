@@ -1,7 +1,5 @@
 """What the worker has to solve: in order, never for long in the loop's way, and tidied up after."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from time import perf_counter, sleep

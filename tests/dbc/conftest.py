@@ -1,7 +1,5 @@
 """The C reader of dbc/README.md."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

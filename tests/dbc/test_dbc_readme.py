@@ -1,7 +1,5 @@
 """dbc/README.md, for the maker of a dashboard, says what the DBC and the service say."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

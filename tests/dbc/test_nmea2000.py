@@ -1,7 +1,5 @@
 """The NMEA 2000 position: payloads and values as canboat's own tests have them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cantools

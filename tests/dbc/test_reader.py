@@ -3,8 +3,6 @@
 Compiled by the command that dbc/README.md states for reader.c.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -43,7 +43,12 @@ def test_j1939_codes_of_common_widths():
 
 
 @pytest.mark.parametrize(("message", "signal"), SIGNALS)
-def test_top_codes_lie_outside_the_range_and_are_named(message, signal):
+def test_a_signal_starts_not_available_with_unit_and_comment_and_its_top_codes_are_named(message, signal):
+    assert signal.raw_initial == (1 << signal.length) - 1
+    assert signal.comment
+    assert len(signal.comment) > 10
+    if signal.unit:  # a physical value says which way is positive, or that it has no sign
+        assert re.search(r"positive|negative", signal.comment), signal.comment
     assert not signal.is_signed
     assert not signal.is_float
     assert signal.minimum is not None
@@ -56,15 +61,6 @@ def test_top_codes_lie_outside_the_range_and_are_named(message, signal):
     assert (signal.minimum - signal.offset) / signal.scale >= -1e-6
     assert signal.choices[error] == "error"
     assert signal.choices[not_available] == "not_available"
-
-
-@pytest.mark.parametrize(("message", "signal"), SIGNALS)
-def test_starts_not_available_with_unit_and_comment(message, signal):
-    assert signal.raw_initial == (1 << signal.length) - 1
-    assert signal.comment
-    assert len(signal.comment) > 10
-    if signal.unit:  # a physical value says which way is positive, or that it has no sign
-        assert re.search(r"positive|negative", signal.comment), signal.comment
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -1,7 +1,5 @@
 """dbc/sample.log is a minute of our frames, and the C reader of dbc/README.md reads it as cantools does."""
 
-from __future__ import annotations
-
 import subprocess
 from collections import defaultdict
 from pathlib import Path

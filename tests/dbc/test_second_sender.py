@@ -1,7 +1,5 @@
 """No reader by the rules of dbc/README.md shows GO while soilbus says otherwise, whatever a second sender does."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Callable, Iterable
 from pathlib import Path

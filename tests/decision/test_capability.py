@@ -1,7 +1,5 @@
 """Capability against brute force (nested scipy root finding)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -361,9 +359,7 @@ def test_a_point_without_a_value_is_mirrored():
 def fitted(name: str, slip: Swing) -> Posterior:
     """What 10 s of a drive tell of a soil."""
     recording = simulate(CONFIG, Scenario(10.0, (Patch(0.0, name),), slip=slip), 3)
-    fit = fit_window(observed(CONFIG, recording.channels, 10.0), prior_of(CONFIG))
-    assert fit is not None
-    return fit.posterior
+    return fit_window(observed(CONFIG, recording.channels, 10.0), prior_of(CONFIG)).posterior
 
 
 def test_the_spread_of_the_largest_draft_equals_that_of_brute_force():

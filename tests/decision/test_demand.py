@@ -1,7 +1,5 @@
 """The present demand: what sensors say of draft and slope, and how well they say it."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import replace
 

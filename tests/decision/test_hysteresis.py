@@ -1,7 +1,5 @@
 """Hysteresis: worse at once, better slowly, never better than the window itself allows."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

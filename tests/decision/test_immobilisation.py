@@ -1,7 +1,5 @@
 """The watch for immobilisation: made-up ground whose end is known, whatever frames bring, and simulated drives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -11,14 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.decision.capability import OverSlip
-from soilbus.decision.moments import Moment, Sample
 from soilbus.decision.watch import Alert, Watch, watched
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import REFERENCES, reference_configuration
-from soilbus.terra.vehicle import GRAVITY
 from soilbus.trials import boggings, firm_drives
 from soilbus.trials.bogging_trials import Drive, Task, WarningTrial, figures, trial, warning_trials
-from watched_drives import Observation, judged, observed, watch
+from watched_drives import Observation, judged, look, observed, watch
 
 CONFIG = reference_configuration()
 SLIP = np.linspace(0.02, 0.6, 9)
@@ -43,14 +39,16 @@ def slip_at(pull):
     return float(np.interp(pull, np.interp(fine, SLIP, pull_at(SLIP)), fine, left=0.0, right=0.7))
 
 
-def look(t, slip, pull, inertia=0.0):
-    """What a vehicle of 2300 kg at 1 m/s shows at a slip and a pull [N]; None: not known."""
-    known, weight = slip is not None and slip < 1.0, 2300.0 * GRAVITY
-    rim = 1.0 / (1.0 - slip) if known else math.nan
-    given = math.nan if pull is None else pull
-    last = Sample(t, 1.0, 1e-4, rim, 1e-4, given / weight, draft=(given - inertia) / weight)
-    common = slip if known else math.nan
-    return Moment(t, 1.0, [rim] * 4, 0.0, False, last=last, common=common, given=given, inertia=inertia, mass=2300.0)
+def seen(looks, curve=CURVE):
+    """States of the watch over looks on ground with one known curve."""
+    states = [Watch()]
+    for moment in looks:
+        states.append(watched(states[-1], moment, curve, CONFIG))
+    return states[1:]
+
+
+def warns(looks, curve=CURVE):
+    return Alert.IMMOBILISATION in {state.warning for state in seen(looks, curve)}
 
 
 def drive(demand, lost=lambda t: 0.0, until=60.0, step=0.1, inertia=lambda t: 0.0):
@@ -139,10 +137,8 @@ def test_on_weakening_ground_the_next_peak_of_the_draft_counts():
 
 
 def test_slip_beyond_the_greatest_warns_whatever_the_trend_says():
-    state = Watch()
-    for t in np.arange(0.0, 4.0, 0.1):
-        state = watched(state, look(t, 0.65, 1000.0), CURVE, CONFIG)
-    assert (state.warning, state.time_left) == (Alert.IMMOBILISATION, 0.0)
+    last = seen(look(t, 0.65, 1000.0) for t in np.arange(0.0, 4.0, 0.1))[-1]
+    assert (last.warning, last.time_left) == (Alert.IMMOBILISATION, 0.0)
 
 
 def test_nothing_is_said_before_a_trend_has_settled_or_without_inputs():
@@ -192,17 +188,13 @@ def test_a_curve_that_is_wrong_by_a_factor_shows_no_weaker_ground_where_the_draf
     """Along it the capacity rises and falls with the draft; where slip grows alone, no factor explains it."""
     unsure = OverSlip(SLIP, scale * pull_at(SLIP), 0.3 * scale * pull_at(SLIP), NONE, NONE)
 
-    def warned(lost):
-        state, alerts = Watch(), set()
-        for i in range(800):
-            t = 0.1 * i
+    def looks(lost):
+        for t in 0.1 * np.arange(800):
             pull = 2200.0 + 500.0 * math.sin(0.5 * t) * (t < 30.0)
-            state = watched(state, look(t, slip_at(pull + lost(t)), pull), unsure, CONFIG)
-            alerts.add(state.warning)
-        return Alert.IMMOBILISATION in alerts
+            yield look(t, slip_at(pull + lost(t)), pull)
 
-    assert not warned(lambda t: 0.0)
-    assert warned(lambda t: 100.0 * max(t - 35.0, 0.0))
+    assert not warns(looks(lambda t: 0.0), unsure)
+    assert warns(looks(lambda t: 100.0 * max(t - 35.0, 0.0)), unsure)
 
 
 @pytest.mark.parametrize(
@@ -257,36 +249,25 @@ def test_scattering_ground_must_surely_weaken():
     rng = np.random.default_rng(2)
     noise = np.repeat(rng.normal(0.0, 250.0, 250), 4)  # patches of half a metre
 
-    def warned(lost):
-        state, alerts = Watch(), set()
-        for i in range(1000):
-            pull = 2500.0 + noise[i]
-            state = watched(state, look(0.1 * i, slip_at(2500.0 + lost(0.1 * i)), pull), CURVE, CONFIG)
-            alerts.add(state.warning)
-        return Alert.IMMOBILISATION in alerts
+    def looks(lost):
+        return (look(0.1 * i, slip_at(2500.0 + lost(0.1 * i)), 2500.0 + noise[i]) for i in range(1000))
 
-    assert not warned(lambda t: 0.0)
-    assert warned(lambda t: 100.0 * max(t - 20.0, 0.0))
+    assert not warns(looks(lambda t: 0.0))
+    assert warns(looks(lambda t: 100.0 * max(t - 20.0, 0.0)))
 
 
 def test_slip_that_creeps_under_a_steady_draft_is_foreseen_where_pull_hardly_depends_on_it():
     flat = OverSlip(SLIP, 3000.0 + 10.0 * SLIP, NONE, NONE, NONE)
-    state, first = Watch(), math.inf
-    for i in range(1000):
-        t, slip = 0.1 * i, 0.2 + 0.02 * max(0.1 * i - 5.0, 0.0)
-        state = watched(state, look(t, slip, 3000.0 + 10.0 * slip), flat, CONFIG)
-        if state.warning is Alert.IMMOBILISATION:
-            first = t
-            break
+    t = 0.1 * np.arange(250)
+    slips = (0.2 + 0.02 * np.maximum(t - 5.0, 0.0)).tolist()
+    states = seen((look(now, s, 3000.0 + 10.0 * s) for now, s in zip(t.tolist(), slips, strict=True)), flat)
+    first = first_warning(zip(t.tolist(), states, strict=True))
     assert 25.0 - first >= AHEAD  # slip passes 0.6 at 25 s; the draft takes nearly all from the start
 
 
 def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
-    state = Watch()
-    for i in range(400):
-        slip = 0.05 * max(math.sin(0.1 * i), 0.0)
-        state = watched(state, look(0.1 * i, slip, pull_at(0.05) * math.sin(0.1 * i)), CURVE, CONFIG)
-        assert state.warning is not Alert.IMMOBILISATION
+    swing = [math.sin(0.1 * i) for i in range(400)]
+    assert not warns(look(0.1 * i, 0.05 * max(s, 0.0), pull_at(0.05) * s) for i, s in enumerate(swing))
 
 
 MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)

@@ -1,7 +1,5 @@
 """Immobilisation ahead, without a soil: the trend's filter against least squares, and what it must not warn of."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

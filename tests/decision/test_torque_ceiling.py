@@ -1,7 +1,5 @@
 """A ceiling is found where torque no longer follows the pull, and only there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,13 +1,12 @@
 """A mass that is uncertain is estimated by the window, and what it leaves open is part of the largest draft's std."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fakes import drive_messages
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.decision.capability import assess
@@ -15,10 +14,7 @@ from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.replay import replay
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, reference_configuration
-from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
 
 HEAVIER = 1.3
@@ -37,7 +33,7 @@ def test_the_largest_draft_follows_the_mass_that_the_drive_shows(tmp_path):
     true = assess(exact, rig_of(driven), model_of(driven), None, limits, 0.6, 0.5)[0].max_draft.value
     found = []
     for seed in (5, 6, 7):
-        write_log(frames(simulate(driven, excited("loam", 24.0), seed=seed), driven), log)
+        write_log(drive_messages(driven, 24.0, seed), log)
         drafts = [r.traversability.max_draft for r in replay(Pipeline(config, load_databases(config)), [log])]
         found.append(np.median([(d.value, d.std) for d in drafts if d is not None], axis=0))
     value, std = np.array(found).T

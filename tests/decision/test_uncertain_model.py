@@ -1,7 +1,5 @@
 """What is not known of the effects in the model takes its share in every deviation: against Monte Carlo."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -4,8 +4,6 @@ J domega/dt = T - r F - r F_roll,    m dV/dt = sum F - R,    F = mu N (1.35 tanh
 R grows with the distance that each wheel turns more than its ground goes by; on a curve each wheel has its own ground.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -17,13 +15,14 @@ import pytest
 from soilbus.config.model import Config
 from soilbus.decision.capability import Capability, Forecast, OverSlip
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.moments import Moment, Sample, common_slip, moment_of
+from soilbus.decision.moments import common_slip, moment_of
 from soilbus.decision.traversability import State, Traversability
 from soilbus.decision.watch import Alert, Warnings, Watch, ended, watched
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, window_of_samples
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.vehicle import GRAVITY, Chassis
+from watched_drives import look
 
 WHEELS = ("FL", "FR", "RL", "RR")
 SIDE = (-1.0, 1.0, -1.0, 1.0)
@@ -290,13 +289,6 @@ def test_where_the_pull_is_known_its_own_slip_is_what_counts():
     assert judged(0.20, pull(0.035)).contradicted == "slip"
     assert judged(0.20, pull(0.20)).state is State.GO  # it accelerates, or pulls more than the demand was
     assert judged(0.35, pull(0.20)).contradicted == "slip"
-
-
-def look(t: float, slip: float, pull: float) -> Moment:
-    """What a vehicle of 2300 kg at 1 m/s shows while its wheels slip so much under so much draft [N]."""
-    rim, share = 1.0 / (1.0 - slip), pull / (2300.0 * GRAVITY)
-    last = Sample(t, 1.0, 1e-4, rim, 1e-4, share, draft=share)
-    return Moment(t, 1.0, [rim] * 4, 0.0, at_limit=False, last=last, common=slip, given=pull, mass=2300.0)
 
 
 def test_a_warning_that_only_lasts_ends_with_a_go_and_does_not_begin_again():

@@ -1,7 +1,5 @@
 """Scores of blocks against exact leave-one-out of a linear Gaussian model, and what a linear effect changes."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`soilbus diagnose` as a user types it: an effect hidden in a log is found, named, added, and the daemon knows it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """The diagnosis of machines whose wheel loads nothing measures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,12 +1,11 @@
 """What a completed model says the tractor can pull is what the simulated tractor pulls."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from fakes import drive_messages
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.decision.balance import Duty, balance
@@ -17,10 +16,8 @@ from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.offline.replay import fed
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.drive import drive
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel, state_on
@@ -114,7 +111,7 @@ def test_the_demand_is_the_draft_without_the_error_of_its_load_cell(tmp_path):
     plain = reference_configuration(["noise.draft.gain=0.0"])  # else the gain as fitted is taken off besides
     config = with_effects(plain, ["draft_offset=300", "draft_gain=0.05"])
     log = tmp_path / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 10.2), seed=3), config), log)
+    write_log(drive_messages(config, 10.2), log)
     needs = []
     for known in (plain, config):
         pipeline = Pipeline(known, load_databases(known))

@@ -1,7 +1,5 @@
 """Delays and low passes of channels, on recordings whose loads shake: the second generator, seeds of their own."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache

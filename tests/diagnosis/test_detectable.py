@@ -1,7 +1,5 @@
 """What a recording could have shown: sizes from the Fisher information, held against effects that are truly there."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 
@@ -97,7 +95,6 @@ def test_more_of_the_same_drive_shows_less_and_a_sensor_less_shows_more():
 
 def shown_by(record: Record) -> tuple[Detectable, ...]:
     base = fit_model([record], PRIOR, ())
-    assert base is not None
     candidates = [CATALOGUE[n] for n in ("torque_lag", "multipass", "slip_sinkage", "draft_offset", "draft_gain")]
     return detectable([record], PRIOR, base, candidates)
 
@@ -108,8 +105,6 @@ def test_a_loss_before_one_motor_that_the_soil_imitates_is_not_said_to_show():
     loss = CATALOGUE["drivetrain_loss"]
     record = recorded(RICH, 1, "drivetrain_loss=0.06", config=config)
     without, beside = (fit_model([record], prior_of(config), effects) for effects in ((), (loss,)))
-    assert without is not None
-    assert beside is not None
     assert without.score - beside.score < 12.0
     (shown,) = detectable([record], prior_of(config), without, [loss])
     assert shown.size is None or shown.size > 0.06
@@ -118,9 +113,7 @@ def test_a_loss_before_one_motor_that_the_soil_imitates_is_not_said_to_show():
 def test_where_no_effect_is_left_none_could_be_shown():
     """A catalogue of one effect, which the model of the type has already."""
     record = recorded(dataclasses.replace(RICH, duration=20.0), 3)
-    base = fit_model([record], PRIOR, ())
-    assert base is not None
-    assert detectable([record], PRIOR, base, []) == ()
+    assert detectable([record], PRIOR, fit_model([record], PRIOR, ()), []) == ()
 
 
 def test_an_effect_that_no_datum_depends_on_has_no_evidence_either_way():

@@ -1,7 +1,5 @@
 """Text, JSON and page of diagnoses that are not clear: a set of names, a gap without a name, numbers that are none."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -41,8 +39,6 @@ def findings() -> Findings:
     """A plain drive, said to be ambiguous."""
     record = recorded(excited("loam", 24.0), 2, name="<a & b>.log")
     base, completed = (fit_model([record], prior_of(CONFIG), effects) for effects in ((), (OFFSET.effect,)))
-    assert base is not None
-    assert completed is not None
     where = (
         Disagreement("draft", "", "slip 0.20..0.35", 312.0, significance=0.0),
         Disagreement("load", "FL", "gain", 0.031, significance=1e-5),

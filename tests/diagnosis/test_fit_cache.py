@@ -1,7 +1,5 @@
 """FitCache: a model is fitted once, and from elsewhere where it explains less than one with fewer effects."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest
@@ -28,17 +26,10 @@ def asked(monkeypatch):
 
     def fit_model(records, prior, effects, starts, options=None):
         calls.append((tuple(e.name for e in effects), starts))
-        cost = costs[calls[-1]]
-        return (
-            None
-            if cost is None
-            else Fitted(
-                neg2_log_posterior=cost,
-                converged=True,
-                effects=tuple(effects),
-                names=tuple(e.name for e in effects),
-            )
-        )
+        if (cost := costs[calls[-1]]) is None:
+            return None
+        names = tuple(e.name for e in effects)
+        return Fitted(neg2_log_posterior=cost, converged=True, effects=tuple(effects), names=names)
 
     monkeypatch.setattr(search_module, "fit_model", fit_model)
     return costs, calls

@@ -1,7 +1,5 @@
 """A fleet's diagnosis: few of the names are false, and a fault is found where it is and from its first log on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -69,7 +67,6 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
     assert onset.probabilities[1] > 0.95
     assert onset.never < 0.01
     for sizes, wanted in zip(onset.sizes, (0.0, 800.0, 800.0), strict=True):
-        assert sizes is not None
         for wheel in rig_of(CONFIG).wheels:
             estimate = sizes[f"offset_{wheel}"]
             assert abs(estimate.value - wanted) < 4.0 * estimate.std + 60.0

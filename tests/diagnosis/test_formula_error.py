@@ -1,7 +1,5 @@
 """What the formula of a true effect leaves gets no name, whoever has put that effect into the model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 
@@ -57,7 +55,6 @@ def test_beside_an_effect_of_the_configuration():
     spring = next(form for form in FORMS if form.title == "tyre_deflection:spring")
     first, second = (log_with(spring, 1.1e-6, 33, log) for log in range(2))
     fitted = fit_model([first], PRIOR, [TYRE])
-    assert fitted is not None
     values = fitted.parameters()[TYRE.name]
     free = [
         replace(f, value=values[f.parameter.name].value, std=values[f.parameter.name].std)

@@ -1,7 +1,5 @@
 """The gap over all blocks, each predicted from the others, against fits from scratch to each choice of blocks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

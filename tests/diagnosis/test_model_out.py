@@ -1,7 +1,5 @@
 """The completed model as a configuration file: what is written reads back as the same model."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

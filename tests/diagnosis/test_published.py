@@ -1,7 +1,5 @@
 """What published single-wheel points show in any case."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -66,7 +64,6 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path) -> dict[str, Beside]
     """
     config = configuration("ding2011", "smooth", errors)
     smooth = fit_model(records_of(config, points), prior_of(config), [CATALOGUE["slip_sinkage"]])
-    assert smooth is not None
     config = configuration("ding2011", "lugged", errors)
     records, prior = records_of(config, points, smooth), prior_of(config)
     fits = {
@@ -74,7 +71,6 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path) -> dict[str, Beside]
         for name, *added in (("nothing",), ("lugs", "lugs"), ("stress_peak_shift", "stress_peak_shift"))
     }
     known = fits["nothing"]
-    assert known is not None
     return {n: Beside(known.score - fit.score, strain(fit)) for n, fit in fits.items() if fit is not None}
 
 

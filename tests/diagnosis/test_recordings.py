@@ -1,13 +1,12 @@
 """Logs as whole records: the bins are those of replay, and a set clock or a long silence begins another part."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fakes import drive_messages
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.diagnosis.records import TooLittle
@@ -15,10 +14,7 @@ from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Wind
 from soilbus.offline.recordings import parts, recordings_of
 from soilbus.offline.replay import LogError, fed
 from soilbus.pipeline.intake import Intake
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
 
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)
@@ -28,7 +24,7 @@ SECONDS = 16.0
 @pytest.fixture(scope="module")
 def log(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("log") / "drive.log"
-    write_log(frames(simulate(CONFIG, excited("loam", SECONDS), seed=4), CONFIG), path)
+    write_log(drive_messages(CONFIG, SECONDS, seed=4), path)
     return path
 
 

@@ -1,7 +1,5 @@
 """Several fields, one vehicle: what is the same on every field is the vehicle's, what differs is the fields'."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

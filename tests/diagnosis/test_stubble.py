@@ -3,8 +3,6 @@
 By the plain model the noise factor of the draft is above 5 in every window: daemon/test_pipeline.py.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

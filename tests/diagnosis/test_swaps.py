@@ -1,7 +1,5 @@
 """The search over sets of effects, on scores that are given: what is added, swapped, removed and left out."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How long a diagnosis takes, in units of one linearisation of the same recording, on any machine."""
 
-from __future__ import annotations
-
 import time
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """What to drive next: the manoeuvre tells rivals apart, can be driven, and more recordings do not mislead the score."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache
@@ -25,13 +23,10 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.soils import SOILS
+from wheels_around import active
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
-
-
-def active(name: str, **values: float) -> Active:
-    return Active(CATALOGUE[name], CATALOGUE[name].neutral | values)
 
 
 LOSS, MORE_LOSS, PUSH = (
@@ -60,9 +55,7 @@ def ambiguous() -> Diagnosis:
 
 @cache
 def planned() -> Plan:
-    plan = what_to_drive(ambiguous(), CONFIG)
-    assert plan is not None
-    return plan
+    return what_to_drive(ambiguous(), CONFIG)
 
 
 def test_the_plan_is_within_the_vehicles_limits_and_reads_back():
@@ -119,15 +112,11 @@ def test_a_drive_that_leaves_no_doubt_is_planned(monkeypatch):
     monkeypatch.setattr(manoeuvre, "patterns", lambda max_slip: few)
     found = ambiguous()
     sure = replace(found, additions=tuple(made_sure(addition) for addition in found.additions))
-    plan = what_to_drive(sure, CONFIG)
-    assert plan is not None
-    assert plan.expected_probability == 1.0
+    assert what_to_drive(sure, CONFIG).expected_probability == 1.0
 
 
 def test_what_excites_determines_a_soil_better_than_steady_driving():
-    found = what_excites(CONFIG, SOILS["loam"])
-    assert found is not None
-    drive, expected = found
+    drive, expected = what_excites(CONFIG, SOILS["loam"])
     assert max(drive.slip) - min(drive.slip) > 0.3
     steady = Scenario(48.0, (Patch(0.0, "loam"),), slip=Swing(0.15, 0.15), side_shift=Swing(0.0, 0.0), slip_spread=0.0)
     fits = [fit_model([recorded(each, 5)], PRIOR, ()) for each in (steady, drive.over(excited("loam", 48.0)))]
@@ -139,10 +128,9 @@ def test_what_excites_determines_a_soil_better_than_steady_driving():
 @pytest.mark.parametrize("held", ["n", "K"])
 def test_what_excites_leaves_out_what_is_held(held):
     config = reference_configuration([f"soil.{held}.std=0"])
-    found = what_excites(config, SOILS["loam"])
-    assert found is not None
-    assert max(found[0].slip) - min(found[0].slip) > 0.3
-    assert found[1].parameters()[held].std == pytest.approx(0.0, abs=1e-12)
+    drive, expected = what_excites(config, SOILS["loam"])
+    assert max(drive.slip) - min(drive.slip) > 0.3
+    assert expected.parameters()[held].std == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("hidden", [PUSH, MORE_LOSS], ids=["draft_offset", "drivetrain_loss"])

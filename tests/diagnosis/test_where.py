@@ -1,7 +1,5 @@
 """Where model and data disagree: nowhere where nothing is missing, and there where something was hidden."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 
@@ -48,9 +46,7 @@ def recorded(
 
 
 def places(record: Record) -> list[Disagreement]:
-    base = fit_model([record], prior_of(CONFIG), ())
-    assert base is not None
-    return disagreements([record], base)
+    return disagreements([record], fit_model([record], prior_of(CONFIG), ()))
 
 
 def test_where_nothing_is_missing_no_place_is_reported():
@@ -112,9 +108,8 @@ def test_regions_of_an_axles_torque_are_of_its_own_wheels():
         return np.where(slip > 0.25, 1200.0, 0.0)
 
     record = recorded("loam", 180.0, 3, "torque.rear", error, "axle motors")
-    base = fit_model([record], prior_of(AXLES), ())
-    assert base is not None
-    found = [p for p in disagreements([record], base) if (p.channel, p.wheel) == ("torque", "rear")]
+    reported = disagreements([record], fit_model([record], prior_of(AXLES), ()))
+    found = [p for p in reported if (p.channel, p.wheel) == ("torque", "rear")]
     thirds = [tuple(map(float, p.region[5:].split(".."))) for p in found if p.region.startswith("slip ")]
     of_rear, of_right = record.held_out.slip[:, 2:].mean(axis=1), record.held_out.slip[:, 1]
     edges, others = (np.quantile(slip, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]) for slip in (of_rear, of_right))
@@ -128,9 +123,7 @@ def test_regions_of_an_axles_torque_are_of_its_own_wheels():
 def test_a_place_names_its_recording():
     sound, late = recorded("loam", 60.0, 4), recorded("loam", 60.0, 3, "torque.RL", too_much_torque)
     records = [dataclasses.replace(sound, name="sound.log"), dataclasses.replace(late, name="late.log")]
-    base = fit_model(records, prior_of(CONFIG), ())
-    assert base is not None
-    found = disagreements(records, base)
+    found = disagreements(records, fit_model(records, prior_of(CONFIG), ()))
     assert (found[0].channel, found[0].wheel, found[0].log) == ("torque", "RL", "late.log")
 
 
@@ -156,9 +149,7 @@ def beside_loss(record: Record) -> tuple[Record, FittedModel]:
         for f in parameters_of(loss, 4)
     ]
     record = record.with_effects([loss], free)
-    base = fit_model([record], prior_of(CONFIG), [loss])
-    assert base is not None
-    return record, base
+    return record, fit_model([record], prior_of(CONFIG), [loss])
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """A simulated drive as the estimator sees it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Windows with braking (negative slip): right within what they say of themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The change detector's threshold: noise passes it as often as asked, and not more."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2

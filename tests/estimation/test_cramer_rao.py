@@ -1,7 +1,5 @@
 """The estimator against the Cramér-Rao bound."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2

@@ -1,7 +1,5 @@
 """Drives drawn at random, and their priors."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Windows with too little variation: what is missing is named, what is determined is reported, intervals are right."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2

@@ -1,7 +1,5 @@
 """Failed fits are reported, counted by kind and become no prior."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the model's form leaves open is in the reported deviations: against a second formula of the wheel."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

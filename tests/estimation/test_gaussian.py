@@ -1,7 +1,5 @@
 """Posteriors of several windows, and what follows from one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import lognorm

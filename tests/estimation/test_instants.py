@@ -1,7 +1,5 @@
 """Instants: means of a window's known bins and their variances; windows share them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Machines of which not every wheel has a torque, a speed and a load: rows, derivatives, noise, intervals."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import replace
@@ -209,7 +207,6 @@ def test_a_signal_of_two_wheels_says_less_than_two_sensors(tmp_path):
         problem = ObservationModel(window_of(config, rig), rig, model_of(config), 0.2)
         objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
         model = objective.quadratic_model(objective.start(soil))
-        assert model is not None
         there = objective.gaussian(soil, np.zeros(len(problem.gain_std)), np.linalg.inv(model.information))
         said.append(there.posterior.tan_phi().std)
     assert said[1] > said[0]
@@ -312,7 +309,6 @@ def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     truth = modelled_drive(config, rig, np.arange(0.05, 6.0, 0.1))
     problem = ObservationModel(window_of(config, rig, swing=0.0), rig, model_of(config), 0.2)
     fit = fit_window(problem, prior_of(config))
-    assert fit is not None
     assert fit.converged
     latents = fit.optimum.latents
     slip = 1.0 - latents.ground_speed[:, None] / (rig.radius * latents.speed)
@@ -333,12 +329,19 @@ def test_the_same_slope_loads_the_same_axle_forward_and_in_reverse(tmp_path):
     assert behind.load == pytest.approx(ahead.load)
 
 
-@pytest.mark.parametrize("machine", ["a cell of the rear axle", "no load cells"])
-def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_path):
-    """Another generator: loads that shake by 13 %; mass, centre of gravity, c and K drawn as their priors say."""
-    off = []
+@pytest.fixture(scope="module")
+def shaken() -> list[shaking.Recording]:
+    """Drives of another generator, whose loads shake by 13 %."""
     grounds = (shaking.LOAM, shaking.CLAY, shaking.STUBBLE, shaking.LOAM)
-    for seed, ground in enumerate(grounds):
+    return [shaking.drive(seed, ground, duration=31.0, shake=4.0) for seed, ground in enumerate(grounds)]
+
+
+@pytest.mark.parametrize("machine", ["a cell of the rear axle", "no load cells"])
+def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, shaken, tmp_path):
+    """Mass, centre of gravity, c and K drawn as their priors say."""
+    off = []
+    for seed, drive in enumerate(shaken):
+        ground = drive.ground
         rng = np.random.default_rng([seed, 7])
         of_c, of_K, of_mass, of_cg = rng.standard_normal(4).tolist()
         config = configured(
@@ -348,9 +351,7 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
             f"soil.c={{value={ground.c * (1.0 + 0.25 * of_c)}, std={0.25 * ground.c}}}",
             f"soil.K={{value={ground.K * (1.0 + 0.25 * of_K)}, std={0.25 * ground.K}}}",
         )  # fmt: skip
-        drive = shaking.drive(seed, ground, duration=31.0, shake=4.0)
         for result in estimated(config, drive)[::2]:
-            assert result.posterior is not None
             tan_phi, pressure = result.posterior.tan_phi(), result.bearing
             off.append((tan_phi.value - np.tan(ground.phi)) / tan_phi.std)
             off.append(np.log(pressure.value / ground.bearing_pressure()) * pressure.value / pressure.std)
@@ -385,7 +386,6 @@ def test_torques_of_the_two_wheels_of_an_axle_show_how_its_load_is_shared_at_eac
     recording, rig = simulate(config, scenario, 3), rig_of(config)
     problem = observed(config, recording.channels, 10.0)
     fit = fit_window(problem, prior_of(config))
-    assert fit is not None
     for left, right in ((0, 1), (2, 3)):
         of_wheels = [np.interp(problem.t, recording.truth["t"], recording.truth[f"load.{rig.wheels[i]}"])
                      for i in (left, right)]  # fmt: skip

@@ -1,7 +1,5 @@
 """Curves of samples: which they follow, what they are worth, how they move."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Fits of simulated windows: errors as reported, the same optimum from every start, missing and impossible data."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -38,11 +36,15 @@ def changed(window: Window, **changes) -> Window:
     return window
 
 
-def set_nan(*index):
+def hit(value, *index):
     def change(column):
-        column[index if len(index) > 1 else index[0]] = np.nan
+        column[index if len(index) > 1 else index[0]] = value
 
     return change
+
+
+def set_nan(*index):
+    return hit(np.nan, *index)
 
 
 EVERYTHING = set_nan(Ellipsis)
@@ -165,13 +167,6 @@ def test_scattered_missing_samples_leave_out_residuals_only(wet_clay, wet_clay_f
     assert fit.converged
     assert fit.rows < wet_clay_fit.rows
     assert np.abs(deviations(fit, wet_clay.soil)).max() < 3.5
-
-
-def hit(value, *index):
-    def change(column):
-        column[index if len(index) > 1 else index[0]] = value
-
-    return change
 
 
 IMPOSSIBLE = {

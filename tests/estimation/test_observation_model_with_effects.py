@@ -1,7 +1,5 @@
 """Predictions of the observation model with effects and their derivatives, for each effect of the catalogue."""
 
-from __future__ import annotations
-
 from copy import copy
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The method of Xi et al. 2024 against its equations written out, scipy, and the figures it prints."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

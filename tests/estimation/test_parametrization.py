@@ -1,7 +1,5 @@
 """Coordinates of the estimation and back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Priors and propagated uncertainty against Monte Carlo of the log-normal distribution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

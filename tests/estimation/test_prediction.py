@@ -1,7 +1,5 @@
 """The share that the model predicts wrong, against wheel forces computed directly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Wild samples are taken out and cost next to nothing; quick real signals stay."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

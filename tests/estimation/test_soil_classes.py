@@ -1,7 +1,5 @@
 """Probabilities of soil classes against Bayes' rule by sampling, on Gaussians and on simulated windows."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

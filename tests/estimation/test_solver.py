@@ -1,7 +1,5 @@
 """Why a descent ends, which steps it accepts, and steps and fits at bounds."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

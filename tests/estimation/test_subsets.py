@@ -1,7 +1,5 @@
 """One, five or all of the six soil parameters free, the others held; and what two tyre widths determine of k_c."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

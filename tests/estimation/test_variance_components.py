@@ -1,7 +1,5 @@
 """Variance components: what sensors are worth is learned from residuals, and errors that last count for as much."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

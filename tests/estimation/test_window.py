@@ -1,7 +1,5 @@
 """Bins against sums made sample by sample."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reversing is driving forward seen in a mirror."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Turns are distinguished from wheels that spin on one side: by signs, by size, by the yaw rate if there is one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The windows of one short drive with a position, and one window of which nothing is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

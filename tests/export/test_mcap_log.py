@@ -1,7 +1,5 @@
 """The MCAP log of a drive: read back by the mcap library, its messages held against their own schemas."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import math

@@ -1,7 +1,5 @@
 """The map of a simulated drive: RFC 7946 by its text, and as GDAL reads it (which is what QGIS opens it with)."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,7 +1,5 @@
 """Windows as rows of CSV and Parquet: the numbers of the JSON lines, under the paths to them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tomllib

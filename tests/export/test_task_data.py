@@ -1,7 +1,5 @@
 """ISOXML task data: read by the peer library `isoxml`, its time log taken apart by the standard's layout."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """The whole check says at once what it cannot do without."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What soilbus depends on, within which bounds."""
 
-from __future__ import annotations
-
 import ast
 import sys
 import tomllib

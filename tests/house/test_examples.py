@@ -1,7 +1,5 @@
 """The examples in docstrings of service/ say what they print."""
 
-from __future__ import annotations
-
 import doctest
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The list of mutations is true to the code; `python -m tests.mutations` runs them."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.mutations import MUTATIONS, ROOT, is_there

@@ -1,7 +1,5 @@
 """The package as others take it: version, types, public names, citation, what wheel and sdist hold."""
 
-from __future__ import annotations
-
 import ast
 import email
 import importlib

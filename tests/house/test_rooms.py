@@ -1,7 +1,5 @@
 """The rooms of the house: imports go one way (service/README.md has the picture)."""
 
-from __future__ import annotations
-
 import ast
 import re
 from functools import cache

@@ -1,7 +1,5 @@
 """Tests rest on what modules offer: no tuning value and no private name of ours is imported by one."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Each line of the threat model names tests that are there."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a log decides that no name does: the driven axle, the kind of accelerometer, signs, which speed is true."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path

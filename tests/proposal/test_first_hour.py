@@ -1,7 +1,5 @@
 """From a bare DBC and a log to valid windows: simulate, init, fill in what is open, check, replay."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

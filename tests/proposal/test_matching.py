@@ -1,7 +1,5 @@
 """Signals matched to roles on DBCs of several naming styles: what is right, what is wrong, what stays open."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Mapping
@@ -186,7 +184,7 @@ def test_a_shaft_without_a_torque_still_asks_for_its_gear(tmp_path, capsys):
         assert [wheel["torque"], wheel["gear_ratio"]] == ["?", "?"]
 
 
-VORN = [
+GERMAN = [
     (385, "ASM_VL_01", {"ASM_VL_Mom_Ist": "Nm", "ASM_VL_Mom_Soll": "Nm", "ASM_VL_Drehz": "1/min"}),
     (386, "ASM_VR_01", {"ASM_VR_Mom_Ist": "Nm", "ASM_VR_Mom_Soll": "Nm", "ASM_VR_Drehz": "1/min"}),
     (432, "Radlast", {"Radlast_HL": "kN", "Radlast_HR": "kN"}),
@@ -226,25 +224,26 @@ def a_dbc(path: Path, messages: list[tuple[int, str, dict[str, str]]]) -> Path:
     return path
 
 
-def test_names_in_german_are_found(tmp_path, capsys):
-    found = mapped(proposed(capsys, a_dbc(tmp_path / "vorn.dbc", VORN)))
-    assert found == {
+IN_GERMAN = [
+    (GERMAN, {
         "wheel.FL.torque": "ASM_VL_01.ASM_VL_Mom_Ist", "wheel.FR.torque": "ASM_VR_01.ASM_VR_Mom_Ist",
         "wheel.FL.speed": "ASM_VL_01.ASM_VL_Drehz", "wheel.FR.speed": "ASM_VR_01.ASM_VR_Drehz",
         "wheel.RL.load": "Radlast.Radlast_HL", "wheel.RR.load": "Radlast.Radlast_HR",
         "signals.acceleration": "Fahrdyn.Laengsbeschl", "signals.pitch": "Fahrdyn.Nickwinkel",
         "signals.draft": "Fahrdyn.Zugkraft", "signals.ground_speed": "Fahrdyn.Radar_Geschw",
-    }  # fmt: skip
-
-
-def test_german_messages_in_the_plural_say_what_their_signals_are(tmp_path, capsys):
-    found = mapped(proposed(capsys, a_dbc(tmp_path / "plurals.dbc", PLURALS)))
-    assert found == {
+    }),
+    (PLURALS, {
         "wheel.FL.torque": "Antrieb_VL.Drehmoment", "wheel.FR.torque": "Antrieb_VR.Drehmoment",
         "wheel.FL.speed": "Raddrehzahlen.Rad_VL", "wheel.FR.speed": "Raddrehzahlen.Rad_VR",
         "wheel.FL.motor_speed": "Antrieb_VL.Drehzahl", "wheel.FR.motor_speed": "Antrieb_VR.Drehzahl",
         "wheel.FL.load": "Radlasten.VL", "wheel.FR.load": "Radlasten.VR", "axle.rear.load": "Achslasten.Hinten",
-    }  # fmt: skip
+    }),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("messages", "expected"), IN_GERMAN, ids=["names", "messages in the plural"])
+def test_names_in_german_are_found(messages, expected, tmp_path, capsys):
+    assert mapped(proposed(capsys, a_dbc(tmp_path / "german.dbc", messages))) == expected
 
 
 def test_a_letter_names_an_axle_where_the_other_axle_has_the_same_name(tmp_path, capsys):
@@ -312,18 +311,13 @@ def test_a_middle_or_a_number_alone_makes_no_third_axle(tmp_path, capsys):
     assert "axle" not in raw
 
 
-def test_what_only_a_unit_fits_is_listed_and_a_difference_of_speeds_is_no_speed(tmp_path, capsys):
+def test_what_only_a_unit_fits_is_listed_and_one_open_torque_of_no_wheel_is_that_of_an_axle(tmp_path, capsys):
     assert main(["init", "--dbc", str(a_dbc(tmp_path / "unnamed.dbc", UNNAMED))]) == 0
     text = capsys.readouterr().out
     assert "#   force: LDC.LDC1 (daN), LDC.LDC2 (daN)" in text
     assert "#   speed: EBC2.RelSpdFrtAxlLftWhl (km/h, relative to another)" in text
-    assert not any("RelSpd" in signal for signal in mapped(tomllib.loads(text)).values())
-
-
-def test_one_open_torque_of_no_wheel_is_that_of_an_axle(tmp_path, capsys):
-    assert main(["init", "--dbc", str(a_dbc(tmp_path / "unnamed.dbc", UNNAMED))]) == 0
-    text = capsys.readouterr().out
     found = tomllib.loads(text)
+    assert not any("RelSpd" in signal for signal in mapped(found).values())  # a difference of speeds is no speed
     (axle,) = found["axle"]
     assert [axle["name"], axle["torque"], axle["motor_speed"]] == ["?", "?", "EMC1.MtrSpd"]
     assert "# EMC1.MtrActTrqPct (%, with reference_torque)" in text

@@ -1,7 +1,5 @@
 """Why windows are of no use and what to do: said in words, with the numbers of the drive."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import replace
@@ -9,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fakes import drive_messages
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.decision.traversability import Status, Traversability
@@ -155,7 +154,7 @@ def test_a_replay_says_that_no_sensor_shows_the_slope(tmp_path):
     config = reference_configuration()
     level = config.model_copy(update={"signals": config.signals.model_copy(update={"pitch": None})})
     log = tmp_path / "drive.log"
-    write_log(frames(simulate(config, excited("loam", 12.0), seed=2), config), log)
+    write_log(drive_messages(config, 12.0, seed=2), log)
     said = {}
     for name, own in (("measured", config), ("level", level)):
         pipeline = Pipeline(own, load_databases(own))

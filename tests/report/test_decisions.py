@@ -1,7 +1,5 @@
 """False warnings in the report of decisions: easy and hard drives apart, each with an interval."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The HTML reports of replay and diagnose: what they say, and that a browser shows them whole and asks for nothing."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import shutil

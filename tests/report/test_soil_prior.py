@@ -1,7 +1,5 @@
 """`soilbus check` tells which known soils the prior leaves out."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

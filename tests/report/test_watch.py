@@ -1,7 +1,5 @@
 """`soilbus watch` on a terminal, in a pipe, of a bus that goes away and of a recording."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io
@@ -22,7 +20,7 @@ import can
 import pytest
 from rich.console import Console
 
-from fakes import FakeClock, ScriptedBus
+from fakes import FakeClock, ScriptedBus, sent_by
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.candump import frame_of
 from soilbus.can.dbc_files import filters_of, output_database
@@ -51,13 +49,7 @@ def sent(seconds: float, state="go", publisher: Publisher | None = None) -> list
         }
         if i % 10 == 0:
             values["SoilbusStatus"] = {"State": "valid", "Reason": "none", "Window": 1}
-        for name, of_frame in values.items():
-            frame = publisher.frame(name, of_frame)
-            found.append(
-                can.Message(
-                    timestamp=BEGIN + 0.1 * i, arbitration_id=frame.arbitration_id, is_extended_id=True, data=frame.data
-                )
-            )
+        found += sent_by(publisher, values, BEGIN + 0.1 * i)
     return found
 
 
@@ -212,6 +204,13 @@ class Terminal:
     def press(self, key: str) -> None:
         os.write(self.near, key.encode())
 
+    def quit(self) -> None:
+        self.press("q")
+        assert self.process.wait(timeout=20.0) == 0
+        self.left = termios.tcgetattr(self.far)
+        os.close(self.near)
+        os.close(self.far)
+
 
 def test_keys_turn_pages_and_leave_the_terminal_as_it_was(tmp_path: Path):
     log = tmp_path / "ours.log"
@@ -223,11 +222,8 @@ def test_keys_turn_pages_and_leave_the_terminal_as_it_was(tmp_path: Path):
     terminal.press("\t")
     terminal.until("DRAFT")
     terminal.press("x")
-    terminal.press("q")
-    assert terminal.process.wait(timeout=20.0) == 0
-    assert termios.tcgetattr(terminal.far) == terminal.usual
-    os.close(terminal.near)
-    os.close(terminal.far)
+    terminal.quit()
+    assert terminal.left == terminal.usual
 
 
 def test_the_last_page_of_a_recording_stands_until_a_key_ends_it(tmp_path: Path):
@@ -238,10 +234,7 @@ def test_the_last_page_of_a_recording_stands_until_a_key_ends_it(tmp_path: Path)
     time.sleep(1.0)  # 10 s of the recording: frames would be stale
     terminal.press("e")
     assert "GO, p = 0.99" in terminal.until("gap (chi-square)")
-    terminal.press("q")
-    assert terminal.process.wait(timeout=20.0) == 0
-    os.close(terminal.near)
-    os.close(terminal.far)
+    terminal.quit()
 
 
 def test_a_recording_in_a_pipe_is_lines_that_name_the_configured_wheels(tmp_path: Path, capfd):

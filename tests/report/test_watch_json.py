@@ -1,7 +1,5 @@
 """`soilbus watch --json`: what the frames say, in the keys and units of `replay --json`; how it ends."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -16,6 +14,7 @@ import can
 import cantools
 import pytest
 
+from fakes import message_of, sent_by
 from soilbus.can.dbc_files import output_database
 from soilbus.can.log_writer import write_log
 from soilbus.can.publish import Publisher
@@ -114,9 +113,7 @@ def recorded(tmp_path: Path, *, seconds: float, foreign_from: float, stop: float
                     "Reason": "none" if alone else "foreign_sender",
                 }
                 values["BusHealth"] = {"ForeignFrames": 0 if alone else i}
-        for name, of_frame in values.items():
-            frame = publisher.frame(name, of_frame)
-            found.append(can.Message(timestamp=1.7e9 + t, arbitration_id=frame.arbitration_id, data=frame.data))
+        found += sent_by(publisher, values, 1.7e9 + t)
     log = tmp_path / "ours.log"
     write_log(found, log)
     return log
@@ -145,11 +142,9 @@ def test_a_second_sender_that_the_service_does_not_name_is_a_line_of_its_own(tmp
     for message in genuine:
         found.append(message)
         if message.arbitration_id == DATABASE.get_message_by_name("PresentDemand").frame_id:
-            other = twin.frame("PresentDemand", {"Draft": 500.0, "Slope": 0.0})
+            other = message_of(twin.frame("PresentDemand", {"Draft": 500.0, "Slope": 0.0}), message.timestamp)
             if message.timestamp == pytest.approx(1.7e9 + 3.0, abs=0.01):
-                found.append(
-                    can.Message(timestamp=message.timestamp, arbitration_id=other.arbitration_id, data=other.data)
-                )
+                found.append(other)
     log = tmp_path / "two.log"
     write_log(found, log)
     lines = lines_of(log, "--speed", "100")
@@ -170,8 +165,6 @@ def test_a_reader_that_has_seen_enough_ends_it_without_a_word() -> None:
     with subprocess.Popen(
         [*WATCH, str(SAMPLE), "--speed", "100"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         assert json.loads(process.stdout.readline())["traversability"]["state"] == "unknown"
         process.stdout.close()
         assert process.wait(timeout=20.0) == 0
@@ -182,8 +175,6 @@ def test_a_reader_that_has_seen_enough_ends_it_without_a_word() -> None:
 def test_a_signal_ends_it_between_two_lines(number: signal.Signals) -> None:
     """Each line is there at once, whole, though the recording goes on for a minute."""
     with subprocess.Popen([*WATCH, str(SAMPLE)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         first = process.stdout.readline()
         process.send_signal(number)
         rest = process.stdout.read()

@@ -1,7 +1,5 @@
 """Loads of a simulated drive that bounce: how much, how fast, and alike on an axle but for its roll."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

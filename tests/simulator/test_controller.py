@@ -1,7 +1,5 @@
 """The example controller of service/docs against the simulated tractor, by the service's frames and the bus's time."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from collections.abc import Iterator
@@ -12,6 +10,7 @@ import can
 import numpy as np
 import pytest
 
+from fakes import message_of, sent_by
 from soilbus.can.candump import Frame, frame_of
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -93,15 +92,10 @@ class Spoofed:
                 "WheelSlip": {"SlipWheel3": 0.2, "SlipWheel4": 0.2},
             }
             values |= {"TractionAdvice": ADVICE} if i % 10 == 0 else {}
-            for name, of_frame in values.items():
-                yield self._message(ours.frame(name, of_frame), 0.1 * i)
+            yield from sent_by(ours, values, 0.1 * i)
             false = theirs.frame("TractionAdvice", ADVICE | {"SlipForEfficiencyRear": 0.9})
             if heard:
-                yield self._message(false, 0.1 * i + 0.01)
-
-    @staticmethod
-    def _message(frame, t: float) -> can.Message:
-        return can.Message(timestamp=t, arbitration_id=frame.arbitration_id, data=frame.data)
+                yield message_of(false, 0.1 * i + 0.01)
 
     def send(self, message: can.Message) -> None:
         self.drafts.append(TRACTOR.decode_message(message.arbitration_id, message.data)["Draft"])

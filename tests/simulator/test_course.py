@@ -1,7 +1,5 @@
 """Where the simulated tractor drives."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The largest draft predicted from a window, beside the truth; and the command that prints it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

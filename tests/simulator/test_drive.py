@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from adaptive import adaptive_forces
+from balances import assert_loads_carry_the_weight, missing_pull
 from soilbus.config.file import load_config
 from soilbus.simulator.drive import SimulationError, drive
 from soilbus.simulator.reference import TRACTOR
@@ -13,7 +14,6 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing, demo, excited
 from soilbus.terra.soils import SOILS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel, state_on
 
-GRAVITY, MASS = 9.80665, 2300.0
 WHEELS = {"FL": (0.50, 0.26), "FR": (0.50, 0.26), "RL": (0.62, 0.38), "RR": (0.62, 0.38)}
 HILLS = ((0.0, 0.0), (10.0, 0.08), (25.0, -0.05), (60.0, 0.02))
 
@@ -43,23 +43,9 @@ def columns(request):
     return drive(config(), SCENARIOS[request.param], seed=7).columns
 
 
-def total(columns, quantity, wheels=WHEELS):
-    return sum(columns[f"{quantity}.{wheel}"] for wheel in wheels)
-
-
-def test_pull_of_the_wheels_is_draft_slope_and_inertia(columns):
-    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"]))
-    miss = total(columns, "drawbar_pull") - along - columns["draft"]
-    assert np.abs(miss).max() < 1e-6 * 1000.0
-
-
-def test_loads_carry_the_weight_and_balance_its_moment(columns):
-    across = MASS * GRAVITY * np.cos(columns["pitch"])
-    assert total(columns, "load") == pytest.approx(across, rel=1e-12)
-    # Moments about the rear contact line: what presses the front axle down holds the tractor level.
-    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"]))
-    front = total(columns, "load", ("FL", "FR"))
-    assert front * 1.95 + columns["draft"] * 0.45 + along * 0.75 == pytest.approx(across * 0.95, rel=1e-9)
+def test_pull_of_the_wheels_is_draft_slope_and_inertia_and_loads_balance(columns):
+    assert np.abs(missing_pull(config(), columns)).max() < 4e-8
+    assert_loads_carry_the_weight(config(), columns)
 
 
 def test_slip_is_that_of_wheel_and_ground_speed(columns):

@@ -1,10 +1,9 @@
 """Effects act on the simulated wheels and sensors as they say, and the balance holds with them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from balances import GRAVITY, WHEELS, missing_pull
 from soilbus.cli.main import main
 from soilbus.config.model import Config, ConfigError
 from soilbus.estimation.assembly import effects_of, with_effects
@@ -18,8 +17,7 @@ from soilbus.terra.effects.effect import Active, Effect
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import WheelModel, state_on, wheel_forces
 
-WHEELS = ("FL", "FR", "RL", "RR")
-GRAVITY, MASS = 9.80665, 2300.0
+MASS = 2300.0
 HILLS = ((0.0, 0.0), (8.0, 0.06), (20.0, -0.03))
 DRIVE = Scenario(15.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.4), slope=HILLS)
 NOISELESS = [f"noise.{q}.{kind}=0.0" for q in ("torque", "load", "draft") for kind in ("gain", "relative", "of_mean")]
@@ -27,10 +25,6 @@ NOISELESS = [f"noise.{q}.{kind}=0.0" for q in ("torque", "load", "draft") for ki
 
 def own(**hooks) -> Active:
     return Active(Effect("own", "", "", "", (), **hooks), {})
-
-
-def total(columns, quantity):
-    return sum(columns[f"{quantity}.{wheel}"] for wheel in WHEELS)
 
 
 def stiffer(state, model, around, values):
@@ -61,8 +55,8 @@ def test_the_balance_holds_with_forces_that_depend_on_load_and_a_resistance_in_n
 
     config = reference_configuration()
     columns = drive(config, DRIVE, 5, [own(forces=rolling_loss), own(resistance=against)]).columns
-    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"])) + 300.0 + 5.0 * columns["t"]
-    assert np.abs(total(columns, "drawbar_pull") - along - columns["draft"]).max() < 1e-8 * MASS * GRAVITY
+    more = (300.0 + 5.0 * columns["t"]) / (MASS * GRAVITY)
+    assert np.abs(missing_pull(config, columns) - more).max() < 1e-8
     for wheel, radius, width in (("FL", 0.50, 0.26), ("RR", 0.62, 0.38)):
         angle, slip, load = (columns[f"{quantity}.{wheel}"] for quantity in ("entry_angle", "slip", "load"))
         of_soil = wheel_forces(state_on(soil_named("loam"), angle, slip, radius, width), WheelModel())
@@ -219,8 +213,5 @@ def test_every_effect_of_the_catalogue_can_be_driven(name):
     assert done.bogged_at is None
     changed, plain = measure(done, config, 5), simulate(config, scenario, 5).channels
     assert any(not np.array_equal(changed[name].value, plain[name].value) for name in plain)
-    columns, around = done.columns, done.surroundings
-    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"])) + columns["draft"]
-    if effect.resistance is not None:
-        along = along + np.ravel(effect.resistance(around, values))
-    assert np.abs(total(columns, "drawbar_pull") - along).max() < 1e-8 * MASS * GRAVITY
+    more = 0.0 if effect.resistance is None else np.ravel(effect.resistance(done.surroundings, values))
+    assert np.abs(missing_pull(config, done.columns) - more / (MASS * GRAVITY)).max() < 1e-8

@@ -1,7 +1,5 @@
 """Calls beside the truth: the figures against independent formulas."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

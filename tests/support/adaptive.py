@@ -1,7 +1,5 @@
 """One wheel's forces by adaptive integration of the paper's equations, independent of the package's quadrature."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a test does when the machine lacks something."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -9,8 +9,6 @@ smaller covariance (Kay, Fundamentals of Statistical Signal Processing, vol. I, 
 where a window leaves soils far from the true one possible, no estimator may reach the bound.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soilbus.estimation.observation_model import ObservationModel

@@ -1,7 +1,5 @@
 """Simulated drives as the daemon's estimator and the tracker see them, window by window."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
@@ -20,7 +18,7 @@ from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.simulator.sensors import true_readings
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
@@ -104,6 +102,13 @@ def errors(posterior: Posterior, soil: Soil) -> np.ndarray:
     estimates = posterior.bearing_pressure(Z_REF, B_REF), posterior.tan_phi()
     truth = soil.bearing_pressure(Z_REF, B_REF), np.tan(soil.phi)
     return np.array([(estimate.value - value) / estimate.std for estimate, value in zip(estimates, truth, strict=True)])
+
+
+def soils_under(recording: Recording, scenario: Scenario, end: float, places: Iterable[float] = (0.0,)) -> list[Soil]:
+    """The true soils at a time [s], at places so far [m] ahead of the vehicle's."""
+    here = np.interp(end, recording.truth["t"], recording.truth["distance"])
+    columns = soil_along(scenario.soils, here + np.array([*places]), scenario.transition)
+    return [Soil(*map(float, soil)) for soil in np.transpose(columns)]
 
 
 def task_of(window: Window, end: float, config: Config, index: int = 0) -> WindowTask:

@@ -1,9 +1,7 @@
 """Scripted bus, clock and workers for tests, a service on them, and the frames of a simulated drive."""
 
-from __future__ import annotations
-
 import errno
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
@@ -13,12 +11,13 @@ import can
 from soilbus.can.admission import Admission
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
+from soilbus.can.publish import Frame, Publisher
 from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.offline.played_bus import InlineExecutor, PlayedClock
+from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
@@ -27,16 +26,26 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
 __all__ = [
-    "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "feed_message",
-    "in_reverse",
+    "Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "Notes", "ScriptedBus", "drive_messages", "fed",
+    "feed_message", "in_reverse", "message_of", "sent_by",
 ]  # fmt: skip
 
 FakeClock = PlayedClock
 
 
-def drive_messages(config: Config, seconds: float) -> list[can.Message]:
+def drive_messages(config: Config, seconds: float, seed: int = 3) -> list[can.Message]:
     """Frames of a good drive on loam: draft swings, slip is what the soil asks for."""
-    return list(frames(simulate(config, excited("loam", seconds), 3), config))
+    return list(frames(simulate(config, excited("loam", seconds), seed), config))
+
+
+def message_of(frame: Frame, t: float = 0.0) -> can.Message:
+    """A frame as python-can hands it out, with a stamp [s]."""
+    return can.Message(timestamp=t, arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
+
+
+def sent_by(publisher: Publisher, values: Mapping[str, Mapping[str, Any]], t: float) -> list[can.Message]:
+    """The frames of these messages with these values, all at one time [s]."""
+    return [message_of(publisher.frame(name, of_frame), t) for name, of_frame in values.items()]
 
 
 def in_reverse(recording: Recording) -> Recording:
@@ -53,6 +62,16 @@ def feed_message(admission: Admission, message: can.Message) -> None:
     admission.feed(
         message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
     )
+
+
+def fed(config: Config, messages: Iterable[can.Message]) -> tuple[Intake, float]:
+    """An intake that has taken these messages, and the time of the last one [s]."""
+    intake, last = Intake(config, load_databases(config)), 0.0
+    for message in messages:
+        feed_message(intake.admission, message)
+        last = message.timestamp
+    intake.ingest()
+    return intake, last
 
 
 class Notes(Notifier):

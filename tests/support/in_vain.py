@@ -26,7 +26,7 @@ from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil
 from soilbus.trials.boggings import largest_draft
 from soilbus.trials.windows import torque_limits
-from statics import WEIGHT, brute_with_rolling, wheel
+from statics import WEIGHT, brute_with_rolling, wheels
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
@@ -325,9 +325,8 @@ SLIPS = np.array([-0.12, -0.06, 0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.19, 0.25, 0.
 
 def _over_load_and_slip(soil: Soil, radius: float, width: float) -> np.ndarray:
     """Pull [N], torque [N m] and entry angle [rad] of one wheel (3, slip, load)."""
-    return np.array([[wheel(soil, load, slip, radius, width)[1:] for load in LOADS] for slip in SLIPS]).transpose(
-        2, 0, 1
-    )
+    sizes = np.full(len(LOADS), radius), np.full(len(LOADS), width)
+    return np.stack([wheels(soil, LOADS, slip, *sizes)[1:] for slip in SLIPS], axis=1)
 
 
 def _at_load(table: np.ndarray, load: float) -> np.ndarray:
@@ -339,16 +338,15 @@ def _at_load(table: np.ndarray, load: float) -> np.ndarray:
 
 def _half_on(left: Soil, slip: float) -> tuple[float, list[dict[str, float]]]:
     """Level pull [N] with left wheels on a soil and right ones on loam, and each wheel's load, torque, sinkage."""
-    sizes = ((0.50, 0.26), (0.50, 0.26), (0.62, 0.38), (0.62, 0.38))
+    radius, width = np.array(list(SIZES.values())).T
 
-    def wheels(pull: float) -> list[np.ndarray]:
+    def sides(pull: float) -> list[np.ndarray]:
+        """(load, pull, torque, entry angle) of the front and the rear wheel (4, 2) on the left, and on the right."""
         front = (WEIGHT * 0.95 - pull * 0.45) / 1.95
-        loads = (front / 2.0, front / 2.0, (WEIGHT - front) / 2.0, (WEIGHT - front) / 2.0)
-        soils = (left, SOILS["loam"], left, SOILS["loam"])
-        return [wheel(*each, slip, *size) for each, size in zip(zip(soils, loads, strict=True), sizes, strict=True)]
+        loads = np.array([front, WEIGHT - front]) / 2.0
+        return [wheels(soil, loads, slip, radius, width) for soil in (left, SOILS["loam"])]
 
-    pull = float(brentq(lambda p: sum(w[1] for w in wheels(p)) - p, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1.0))
-    return pull, [
-        {"load": w[0], "torque": w[2], "sinkage": size[0] * (1.0 - np.cos(w[3]))}
-        for w, size in zip(wheels(pull), sizes, strict=True)
-    ]
+    pull = float(brentq(lambda p: sum(side[1].sum() for side in sides(p)) - p, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1.0))
+    load, _, torque, angle = np.stack(sides(pull), axis=2).reshape(4, -1)  # FL, FR, RL, RR
+    depth = np.repeat(radius, 2) * (1.0 - np.cos(angle))
+    return pull, [{"load": w, "torque": t, "sinkage": z} for w, t, z in zip(load, torque, depth, strict=True)]

@@ -5,8 +5,6 @@ by as much as its sd says, so that the model holds. It is estimated without an e
 deviations and bounds are those of logarithms.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass

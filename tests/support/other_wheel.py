@@ -5,8 +5,6 @@ axle; the stress behind the greatest one is that in front at the same share of i
 Shear by Janosi & Hanamoto, 1 - exp(-j/K), or the rational law j / (j + K).
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Records of simulated drives, as the diagnosis takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 
 from soilbus.can.channels import Column

@@ -6,8 +6,6 @@ catalogue of effects), and a test compares the pages in `service/docs` with it.
     python tests/support/reference_pages.py service/docs     writes them again
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import inspect
@@ -122,10 +120,15 @@ def _toml(value: Any) -> str:
 
 
 @cache
+def _parsed_model() -> list[ast.stmt]:
+    return ast.parse(inspect.getsource(model)).body
+
+
+@cache
 def _attribute_docs(section: type[BaseModel]) -> dict[str, str]:
     """The text below each attribute of a section, in one line."""
     found: dict[str, str] = {}
-    for node in ast.parse(inspect.getsource(model)).body:
+    for node in _parsed_model():
         if isinstance(node, ast.ClassDef) and node.name == section.__name__:
             for attribute, below in zip(node.body, node.body[1:], strict=False):
                 text = getattr(getattr(below, "value", None), "value", None)

@@ -6,8 +6,6 @@ The contact is that of `other_wheel`.  Each message has its own rate, phase and 
 delay, first-order lag, noise and fixed gain error (shared/field/README.md).
 """
 
-from __future__ import annotations
-
 import gzip
 import math
 from collections.abc import Mapping
@@ -60,12 +58,12 @@ PERIODS = {
 """Seconds between two frames of a message."""
 _CARRIES = {
     "torque": "Mcu", "speed": "WheelSpeeds", "load": "AxleLoads", "draft": "DrawbarPin", "pitch": "Attitude",
-    "ground_speed": "GroundBasedSpeedAndDistance", "acceleration": "Attitude", "sinkage": "RideHeight",
+    "ground_speed": "GroundBasedSpeedAndDistance", "acceleration": "Attitude",
 }  # fmt: skip
 _NOISE = {  # absolute, relative, of the mean; sd of the fixed gain error
     "torque": (0.0, 0.0, 0.01, 0.005), "load": (0.0, 0.01, 0.0, 0.005), "speed": (0.0, 0.002, 0.0, 0.0015),
     "ground_speed": (0.0, 0.008, 0.0, 0.002), "draft": (40.0, 0.0, 0.0, 0.005), "pitch": (0.002, 0.0, 0.0, 0.0),
-    "acceleration": (0.0, 0.0, 0.0, 0.0), "sinkage": (0.004, 0.0, 0.0, 0.0),
+    "acceleration": (0.0, 0.0, 0.0, 0.0),
 }  # fmt: skip
 _MODES = ((2.6, 0.12), (4.0, 0.12), (3.3, 0.15))
 """Natural frequency [Hz] and damping ratio of bounce, pitch and roll on the tyres."""
@@ -112,7 +110,6 @@ def _signals(message: str) -> dict[str, tuple[str, float]]:
         "AxleLoads": {w: (f"load.{w}", 1.0) for w in WHEELS},
         "DrawbarPin": {"Draft": ("draft", 1.0)},
         "GroundBasedSpeedAndDistance": {"GroundBasedMachineSpeed": ("ground_speed", 1.0)},
-        "RideHeight": {f"Sink{w}": (f"sinkage.{w}", 1e3) for w in WHEELS},
         "Attitude": {"Pitch": ("pitch", 1.0), "LongAccel": ("acceleration", 1.0)},
     }.get(message, {})
 
@@ -124,24 +121,19 @@ def drive(
     shake: float = 1.0,
     delays: Mapping[str, float] | None = None,
     lags: Mapping[str, float] | None = None,
-    periods: Mapping[str, float] | None = None,
-    with_sinkage: bool = False,
 ) -> Recording:
     """Drive with a draft that wanders and jerks, over a rough field (`shake` 0: a smooth one; 1: loads shake by
     3 % (sd), 4: by 13 %).
 
     delays and lags [s] by quantity ("torque", "load", ...): a sample with the stamp t reads what was at t - delay,
-    behind a first-order lag.  periods [s] by message in place of PERIODS.
+    behind a first-order lag.
     """
     rng = np.random.default_rng([seed, 20260])
     truth = _truth(rng, ground, duration, shake)
     t = truth["t"]
-    rates = PERIODS | dict(periods or {})
-    clocks = {name: _clock(rng, period, duration) for name, period in rates.items()}
+    clocks = {name: _clock(rng, period, duration) for name, period in PERIODS.items()}
     channels: dict[str, tuple[Array, Array]] = {}
     for quantity, message in _CARRIES.items():
-        if quantity == "sinkage" and not with_sinkage:
-            continue
         of_wheels = f"{quantity}.FL" in truth
         for wheel in WHEELS if of_wheels else ("",):
             name = f"{quantity}.{wheel}" if wheel else quantity
@@ -204,7 +196,7 @@ def _truth(rng: np.random.Generator, ground: Ground, duration: float, shake: flo
         angle = carrying(ground, Contact(), load[i], slip[i], RADIUS[i], WIDTH[i])
         torque = forces(ground, Contact(), angle, slip[i], RADIUS[i], WIDTH[i])[2]
         columns |= {f"load.{wheel}": load[i], f"torque.{wheel}": torque, f"speed.{wheel}": omega[i]}
-        columns |= {f"sinkage.{wheel}": RADIUS[i] * (1.0 - np.cos(angle)), f"slip.{wheel}": slip[i]}
+        columns[f"slip.{wheel}"] = slip[i]
     return columns
 
 

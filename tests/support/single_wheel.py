@@ -1,7 +1,5 @@
 """A simulated test rig: one wheel pulled through a soil bed at given loads and slips."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

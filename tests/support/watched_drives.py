@@ -1,7 +1,6 @@
 """The watch for immobilisation on simulated drives, with options that may differ from the service's."""
 
-from __future__ import annotations
-
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,15 +9,25 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
-from soilbus.decision.moments import Moment, bins_of_a_moment, moments
+from soilbus.decision.moments import Moment, Sample, bins_of_a_moment, moments
 from soilbus.decision.options import WATCH, WatchOptions
 from soilbus.decision.watch import Alert, Watch, watched
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.terra.vehicle import GRAVITY
 from soilbus.trials.bogging_trials import Drive, Task, WarningTrial, driven, rated
 from soilbus.trials.windows import bins_of, task_of, torque_limits
+
+
+def look(t: float, slip: float | None, pull: float | None, inertia: float = 0.0) -> Moment:
+    """What a vehicle of 2300 kg at 1 m/s shows at a slip and a pull [N]; None: not known."""
+    weight, given = 2300.0 * GRAVITY, math.nan if pull is None else pull
+    common = slip if slip is not None and slip < 1.0 else math.nan
+    rim = 1.0 / (1.0 - common)
+    last = Sample(t, 1.0, 1e-4, rim, 1e-4, given / weight, draft=(given - inertia) / weight)
+    return Moment(t, 1.0, [rim] * 4, 0.0, False, last=last, common=common, given=given, inertia=inertia, mass=2300.0)
 
 
 class Observation(NamedTuple):

@@ -1,18 +1,22 @@
 """Four wheels on a soil and all that effects may depend on, made from one seed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import WheelState, state_on
 
 RADIUS = np.array([0.5, 0.5, 0.62, 0.62])
 WIDTH = np.array([0.26, 0.26, 0.32, 0.32])
 REAR = np.array([False, False, True, True])
+
+
+def active(name: str, **values: float) -> Active:
+    """An effect with these values, and neutral ones else."""
+    return Active(CATALOGUE[name], CATALOGUE[name].neutral | values)
 
 
 def wheels_around(

@@ -1,7 +1,5 @@
 """Derivatives that numbers carry along, against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

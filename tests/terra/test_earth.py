@@ -1,7 +1,5 @@
 """Small distances on the ellipsoid against geodesics."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where shear turns under a skidding wheel, against a root finder on the shear displacement itself."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The table of soils: spot checks against Wong's printed numbers, and sanity of every row."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

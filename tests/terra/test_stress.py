@@ -1,7 +1,5 @@
 """Stress laws against hand-made numbers, numerical integration and their own derivatives."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Derivatives by all that effects may change about a wheel, against differences of the forces themselves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A track's forces against adaptive integration of its equations, its derivatives, and calculations by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Loads and pull of the vehicle against forces and moments written out point by point."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """One wheel's forces against adaptive integration of the paper's equations, and its derivatives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

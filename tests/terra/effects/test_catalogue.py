@@ -1,7 +1,5 @@
 """All effects alike: their names, their neutral values, finite and continuous over their ranges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Effects of the contact against integrals by scipy, hand formulas and limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -10,10 +8,10 @@ from scipy.integrate import quad
 
 from adaptive import adaptive_forces, exponential, rational
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Active, forces_with, wheel_with
+from soilbus.terra.effects.effect import forces_with, wheel_with
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage, state_on, wheel_forces
-from wheels_around import RADIUS, WIDTH, one_wheel, wheels_around
+from wheels_around import RADIUS, WIDTH, active, one_wheel, wheels_around
 
 MODEL = WheelModel("rational")
 _, AROUND = wheels_around(size=2)
@@ -23,9 +21,7 @@ EACH_WHEEL = pytest.mark.parametrize("state", WHEELS, ids=["clay", "loam", "sand
 
 
 def with_effect(name: str, state: WheelState, model: WheelModel = MODEL, around=None, **values: float) -> np.ndarray:
-    effect = CATALOGUE[name]
-    active = Active(effect, effect.neutral | values)
-    return forces_with([active], state, model, one_wheel(AROUND) if around is None else around)
+    return forces_with([active(name, **values)], state, model, one_wheel(AROUND) if around is None else around)
 
 
 def same(ours: np.ndarray, true: np.ndarray, tolerance: float = 1e-6) -> None:
@@ -104,11 +100,9 @@ def test_lugs_shear_at_their_sides_as_bekker_has_it():
 
 def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():
     """The substitute circle goes through both points; geometry by hand."""
-    effect = CATALOGUE["tyre_deflection"]
     state = state_on(soil_named("loam"), 0.35, 0.15, 0.5, 0.3)
-    around, compliance = one_wheel(AROUND, load=8e3), 4e-6
-    changed, _ = wheel_with([Active(effect, {"compliance": compliance, "behind": 0.0})], state, MODEL, around)
-    delta = 0.032
+    around, delta = one_wheel(AROUND, load=8e3), 0.032
+    changed, _ = wheel_with([active("tyre_deflection", compliance=4e-6, behind=0.0)], state, MODEL, around)
     z, half_chord = sinkage(0.35, changed.radius), changed.radius * math.sin(0.35)
     hub_above_surface = 0.5 - delta - z
     assert math.hypot(hub_above_surface, half_chord) == pytest.approx(0.5, rel=1e-12)
@@ -121,7 +115,7 @@ def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():
 def test_a_soft_tyres_torque_acts_at_its_rolling_radius():
     state = state_on(soil_named("loam"), 0.35, 0.15, 0.5, 0.3)
     around, delta = one_wheel(AROUND, load=8e3), 0.032
-    effect = Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3, "behind": 0.0})
+    effect = active("tyre_deflection", compliance=delta / 8e3, behind=0.0)
     changed, model = wheel_with([effect], state, MODEL, around)
     rigid = adaptive_forces(changed, model)
     W, DP, T = forces_with([effect], state, MODEL, around)
@@ -137,15 +131,9 @@ def test_the_flat_behind_the_axle_is_a_plate_that_has_slipped(slip):
     """
     state = state_on(soil_named("loam"), 0.35, slip, 0.5, 0.3)
     around, delta, share = one_wheel(AROUND, load=8e3), 0.032, 0.7
-    with_flat, without = (
-        forces_with(
-            [Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3, "behind": behind})], state, MODEL, around
-        )
-        for behind in (share, 0.0)
-    )
-    circle, slip = wheel_with(
-        [Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3, "behind": share})], state, MODEL, around
-    )[0][2::-1][:2]
+    flat, none = ([active("tyre_deflection", compliance=delta / 8e3, behind=behind)] for behind in (share, 0.0))
+    with_flat, without = (forces_with(effects, state, MODEL, around) for effects in (flat, none))
+    circle, slip = wheel_with(flat, state, MODEL, around)[0][2::-1][:2]
     z = circle * (1.0 - math.cos(0.35))
     pressure = state.K_L * z**state.n
     chord = math.sqrt(0.5**2 - (0.5 - delta) ** 2)
@@ -160,10 +148,9 @@ def test_the_flat_behind_the_axle_is_a_plate_that_has_slipped(slip):
 
 def test_a_stiff_tyre_is_a_rigid_wheel_and_a_softer_one_sinks_less():
     state, around = wheels_around("loam", seed=6, slip=(0.02, 0.6))
-    effect = CATALOGUE["tyre_deflection"]
 
     def forces(compliance: float) -> np.ndarray:
-        return forces_with([Active(effect, {"compliance": compliance, "behind": 0.5})], state, MODEL, around)
+        return with_effect("tyre_deflection", state, around=around, compliance=compliance, behind=0.5)
 
     rigid = wheel_forces(state, MODEL)
     small, smaller = (np.max(np.abs(forces(x) - rigid)) for x in (1e-10, 1e-11))
@@ -173,14 +160,9 @@ def test_a_stiff_tyre_is_a_rigid_wheel_and_a_softer_one_sinks_less():
 
 def test_a_deflection_stops_where_the_rim_strikes_through():
     state, around = wheels_around("loam", seed=6)
+    soft = [active("tyre_deflection", compliance=2e-5, behind=0.0)]
     at_limit, beyond = (
-        wheel_with(
-            [Active(CATALOGUE["tyre_deflection"], {"compliance": 2e-5, "behind": 0.0})],
-            state,
-            MODEL,
-            around._replace(load=load),
-        )
-        for load in (0.3 * WIDTH / 2e-5, 9e4)
+        wheel_with(soft, state, MODEL, around._replace(load=load)) for load in (0.3 * WIDTH / 2e-5, 9e4)
     )
     assert beyond[0].radius == pytest.approx(at_limit[0].radius, rel=1e-12)
     assert np.all(np.isfinite(beyond[0].radius))

@@ -1,7 +1,5 @@
 """Effects of the soil against integrals by scipy, hand formulas and limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -11,12 +9,11 @@ from scipy.interpolate import CubicSpline
 from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Active, forces_with, wheel_with
-from soilbus.terra.effects.soil import SLIP_SINKAGE
+from soilbus.terra.effects.effect import forces_with, wheel_with
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import INPUTS, WheelModel, WheelState, state_on, wheel_forces, wheel_forces_and_derivatives
-from wheels_around import REAR, one_wheel, wheels_around
+from wheels_around import REAR, active, one_wheel, wheels_around
 
 MODEL = WheelModel("rational")
 STATE, AROUND = wheels_around(seed=7)
@@ -25,20 +22,14 @@ TYRE_PRESSURE = 1e5
 
 
 def changed(name: str, state: WheelState = STATE, around=AROUND, **values: float) -> WheelState:
-    effect = CATALOGUE[name]
-    return wheel_with([Active(effect, effect.neutral | values)], state, MODEL, around)[0]
+    return wheel_with([active(name, **values)], state, MODEL, around)[0]
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.1, 0.4, 0.8])
 def test_the_sinkage_exponent_grows_with_slip(slip):
     """Ding et al. 2010: sigma = K z^(n0 + n1 s), here with the same pressure at 5 cm whatever n1."""
     state = state_on(soil_named("loam"), 0.4, slip, 0.5, 0.3)
-    ours = forces_with(
-        [Active(CATALOGUE["slip_sinkage"], {"exponent": 0.5, "softening": 0.0, "dug": 0.0})],
-        state,
-        MODEL,
-        one_wheel(AROUND),
-    )
+    ours = forces_with([active("slip_sinkage", exponent=0.5)], state, MODEL, one_wheel(AROUND))
     true = adaptive_forces(state, MODEL, pressure=lambda z: state.K_L * 0.05**0.7 * (z / 0.05) ** (0.7 + 0.5 * slip))
     assert np.max(np.abs(ours - true)) < 1e-6 * true[0]
 
@@ -56,13 +47,14 @@ def test_softening_gives_sinkage_times_a_function_of_slip():
 def test_a_wheel_meets_the_soil_below_the_layer_that_it_throws_back(slip):
     """Reece 1965: the contact is that of a wheel less deep by what is dug; the wheel has sunk as deep as before."""
     state = state_on(soil_named("loam"), 0.45, slip, 0.5, 0.3)
-    around, dug = one_wheel(AROUND), 0.06
-    ours = forces_with([Active(CATALOGUE["slip_sinkage"], SLIP_SINKAGE.neutral | {"dug": dug})], state, MODEL, around)
+    dug = 0.06
+    digs = [active("slip_sinkage", dug=dug)]
+    ours = forces_with(digs, state, MODEL, one_wheel(AROUND))
     left = 0.5 * (1.0 - math.cos(0.45)) - dug * slip
     met = adaptive_forces(state._replace(entry_angle=math.acos(1.0 - left / 0.5)), MODEL)
     assert np.max(np.abs(ours - met)) < 1e-8 * met[0]
     wheel = Wheel(np.array(0.5), np.array(0.3), False, np.array(5000.0))
-    completed = CompletedModel.of(MODEL, [Active(SLIP_SINKAGE, SLIP_SINKAGE.neutral | {"dug": dug})], 1.0)
+    completed = CompletedModel.of(MODEL, digs, 1.0)
     assert completed.sinkage(np.array(0.45), wheel) == pytest.approx(0.5 * (1.0 - math.cos(0.45)), rel=1e-12)
 
 
@@ -94,8 +86,8 @@ def test_bearing_grows_with_a_power_of_the_speed():
 
 
 def test_only_rear_wheels_run_in_ruts():
-    values = {"stiffness": math.log(2.5), "density": math.log(1.2), "shear": math.log(1.6), "reloading": math.log(1.3)}
-    effect = Active(CATALOGUE["multipass"], values)
+    factors = {"stiffness": 2.5, "density": 1.2, "shear": 1.6, "reloading": 1.3}
+    effect = active("multipass", **{name: math.log(factor) for name, factor in factors.items()})
     ours, plain = forces_with([effect], STATE, MODEL, AROUND), wheel_forces(STATE, MODEL)
     n = STATE.n / 1.3
     depth = (TYRE_PRESSURE / STATE.K_L) ** (1.0 / STATE.n)
@@ -114,18 +106,15 @@ def test_a_hard_pan_adds_to_the_pressure_below_its_depth(soil, depth):
         own = state.K_L * z**state.n
         return own if z < depth else own + 6.0 * (own - state.K_L * depth**state.n)
 
-    ours = forces_with(
-        [Active(CATALOGUE["hardpan"], {"stiffness": 6.0, "depth": depth})], state, MODEL, one_wheel(AROUND)
-    )
+    ours = forces_with([active("hardpan", stiffness=6.0, depth=depth)], state, MODEL, one_wheel(AROUND))
     true = adaptive_forces(state, MODEL, pressure=pressure, kink=depth)
     assert np.max(np.abs(ours - true)) < 1e-8 * true[0]
 
 
 def test_a_hard_pan_that_is_not_reached_changes_nothing():
-    pan = Active(CATALOGUE["hardpan"], {"stiffness": 20.0, "depth": 0.3})
     state = STATE._replace(entry_angle=0.3)
     plain = wheel_forces(state, MODEL)
-    ours = forces_with([pan], state, MODEL, AROUND)
+    ours = forces_with([active("hardpan", stiffness=20.0, depth=0.3)], state, MODEL, AROUND)
     assert np.max(np.abs(ours - plain), axis=(1, 2)) / np.max(plain[0]) == pytest.approx(0.0, abs=1e-7)
 
 

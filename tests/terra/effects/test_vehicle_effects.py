@@ -1,7 +1,5 @@
 """Effects of the vehicle and of its sensors against hand formulas, np.interp and exact derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -10,11 +8,11 @@ from scipy.signal import lsim, lti
 
 from soilbus.terra.effects.along import stretches
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Active, wheel_with
+from soilbus.terra.effects.effect import wheel_with
 from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import WheelModel
-from wheels_around import RADIUS, REAR, wheels_around
+from wheels_around import RADIUS, REAR, active, wheels_around
 
 STATE, AROUND = wheels_around(seed=8)
 T = np.linspace(0.0, 30.0, 301)
@@ -60,9 +58,7 @@ def test_a_slope_changes_along_the_way():
 
 
 def test_worn_tyres_slip_otherwise_than_they_seem():
-    worn, _ = wheel_with(
-        [Active(CATALOGUE["rolling_radius"], {"front": -0.05, "rear": 0.03})], STATE, WheelModel(), AROUND
-    )
+    worn, _ = wheel_with([active("rolling_radius", front=-0.05, rear=0.03)], STATE, WheelModel(), AROUND)
     true = np.where(REAR, 1.03, 0.95) * RADIUS
     assert worn.radius == pytest.approx(true, rel=1e-12)
     assert worn.slip == pytest.approx(slip_ratio(true, AROUND.wheel_speed, AROUND.ground_speed), abs=1e-12)
