@@ -226,11 +226,7 @@ def _diagnose_all(
 
 
 def _diagnosed(
-    client: Any,
-    vehicles: Sequence[Sequence[Job]],
-    parts: Path,
-    progress: Callable[[str], None],
-    retry: bool,
+    client: Any, vehicles: Sequence[Sequence[Job]], parts: Path, progress: Callable[[str], None], retry: bool
 ) -> list[dict[str, Any]]:
     """Findings of each vehicle; those that are kept are not made again."""
 

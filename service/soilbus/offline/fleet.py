@@ -115,11 +115,7 @@ def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "false_discovery_rate": FALSE_DISCOVERY_RATE,
         "vehicles_diagnosed": diagnosed,
         "effects": [
-            {
-                "name": name,
-                "vehicles_named": names[name],
-                "expected_share": expected[name] / diagnosed,
-            }
+            {"name": name, "vehicles_named": names[name], "expected_share": expected[name] / diagnosed}
             for name in sorted(expected)
         ],
         "vehicles": list(findings),

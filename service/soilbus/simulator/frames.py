@@ -148,10 +148,7 @@ def _unmapped_signals(
     mapped = {channel.signal for channel in channels}
     gears = {wheel.name: wheel.gear_ratio for wheel in config.wheel} | {a.name: a.gear_ratio for a in config.axle}
     motor = next((c.wheel for c in channels if c.quantity == "torque"), None)
-    known = {
-        "GroundBasedMachineDistance": truth["distance"],
-        "GroundBasedMachineDirection": np.ones_like(truth["t"]),
-    }
+    known = {"GroundBasedMachineDistance": truth["distance"], "GroundBasedMachineDirection": np.ones_like(truth["t"])}
     if motor is not None:
         known["ShaftSpeed"] = true_speed(truth, config, motor) * gears[motor] * 30.0 / math.pi
     names = {signal.name for signal in message.signals} - mapped

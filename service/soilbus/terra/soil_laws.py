@@ -68,8 +68,5 @@ def rational_shear(ratio: Any) -> tuple[Any, Any]:
     return ratio * share, share**2
 
 
-SHEAR_LAWS: dict[str, ShearLaw] = {
-    "exponential": exponential_shear,
-    "rational": rational_shear,
-}
+SHEAR_LAWS: dict[str, ShearLaw] = {"exponential": exponential_shear, "rational": rational_shear}
 """Shear laws by the name that the configuration has for them."""

@@ -31,12 +31,7 @@ from soilbus.terra.contact_stress import (
 )
 from soilbus.terra.hardpan import by_pan, pan_stresses, reaching
 from soilbus.terra.soil_laws import lumped_modulus
-from soilbus.terra.track import (
-    track_forces,
-    track_forces_and_jacobian,
-    track_forces_and_slopes,
-    track_load_and_slope,
-)
+from soilbus.terra.track import track_forces, track_forces_and_jacobian, track_forces_and_slopes, track_load_and_slope
 from soilbus.terra.wheel_state import EXACT_NODES, FAST_NODES, WheelModel, WheelState
 
 __all__ = [

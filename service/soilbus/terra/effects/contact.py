@@ -168,11 +168,7 @@ def _flattened_forces(forces: Forces, state: WheelState, around: Surroundings, v
     mobilised = np.exp(-np.maximum(-j_K, 0.0)) - np.exp(-np.maximum(j_K, 0.0))  # backwards where the wheel skids
     sheared = (state.c + pressure * state.tan_phi) * mobilised
     arm = _rolling(nominal, delta)
-    return (
-        forces[0] + area * pressure,
-        forces[1] + area * sheared,
-        (forces[2] / circle + area * sheared) * arm,
-    )
+    return (forces[0] + area * pressure, forces[1] + area * sheared, (forces[2] / circle + area * sheared) * arm)
 
 
 def _half_flat(radius: Any, deflection: Any) -> Any:

@@ -106,10 +106,7 @@ ROLLING_RADIUS = Effect(
     physics="The tyres are not of the radius written down: worn, or others fitted; so slip is not what it seems.",
     source="slip 1 - V/(r omega): Wong 2008, ch. 1",
     tells="rolling free without draft or torque on firm ground: slip must then be nearly zero; a sinkage sensor",
-    parameters=(
-        Parameter("front", "1", 0.0, 0.03, -0.15, 0.15),
-        Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15),
-    ),
+    parameters=(Parameter("front", "1", 0.0, 0.03, -0.15, 0.15), Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15)),
     wheel=_true_radius,
     of_tyre=True,
     ruled_out="a rigid wheel is not worn or inflated: its radius is what a ruler says",
