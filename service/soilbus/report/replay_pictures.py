@@ -57,7 +57,6 @@ STATUSES = {
     Status.INVALID: Look("invalid", "#ffffff", "xx", "o"),
 }
 
-
 FRICTION = (lambda r: None if r.posterior is None else r.posterior.parameters()["phi"]), math.radians(1.0)
 """The friction angle of a window, and the unit of its picture."""
 HOLD = "How well {} hold against shearing off?"

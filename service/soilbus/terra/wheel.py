@@ -56,7 +56,6 @@ _CHUNK = 16384
 """Nodes of a branch that are integrated at once: all fields of this many stay in the processor's cache.  Short
 of it small chunks cost twice as much, given that the allocator keeps its memory (soilbus.allocator)."""
 
-
 FORCES = ("load", "drawbar_pull", "torque")
 """What wheel_forces() returns: W [N], DP [N], T [N m]."""
 INPUTS = ("entry_angle", "slip", "K_L", "n", "tan_phi", "c", "K")
