@@ -78,9 +78,7 @@ def replay(log: Logs, config: Config | PathLike) -> Any:
         else:
             results = list(replay_logs(Pipeline(used, load_databases(used)), paths))
     rows = [flat_record(window_record(result, used)) for result in results]
-    if find_spec("pandas") is None:
-        return rows
-    return frame_of(rows, column_names(rows))
+    return rows if find_spec("pandas") is None else frame_of(rows, column_names(rows))
 
 
 @dataclass(frozen=True, repr=False)
@@ -153,8 +151,7 @@ class Diagnosis:
             raise ValueError("diagnose() was given a configuration without its file: give the path of the TOML file")
         out = Path(out)
         effects, notes = effect_tables(self.findings.diagnosis.completed)
-        text = with_effects_text(self.path, [], effects, out.parent, notes)
-        write_text(out, text)
+        write_text(out, with_effects_text(self.path, [], effects, out.parent, notes))
 
 
 def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:

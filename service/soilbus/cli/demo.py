@@ -148,8 +148,8 @@ def _svg(shown: Group) -> str:
 
 def _story(results: list[WindowResult]) -> str:
     """The windows some seconds apart, as a table."""
-    rows, due = [], results[0].t if results else 0.0
-    begin = due
+    rows, begin = [], results[0].t if results else 0.0
+    due = begin
     for r in results:
         if r.t + 1e-6 < due:
             continue

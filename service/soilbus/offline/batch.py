@@ -129,15 +129,9 @@ def run_batch(
     stale = [] if diagnose else [path for name in OF_DIAGNOSIS if (path := out / name).exists()]
     for path in stale:
         path.unlink()
-    return Batch(
-        vehicles,
-        errors,
-        sum(windows.values()),
-        len(before),
-        sum(each.fault is not None for each in before.values()),
-        _diagnose_all(client, jobs, summaries, out, progress, retry) if diagnose else None,
-        bool(stale),
-    )
+    fleet = _diagnose_all(client, jobs, summaries, out, progress, retry) if diagnose else None
+    failed_before = sum(each.fault is not None for each in before.values())
+    return Batch(vehicles, errors, sum(windows.values()), len(before), failed_before, fleet, bool(stale))
 
 
 def _all_kept(jobs: Sequence[Job], parts: Path) -> dict[str, Outcome]:

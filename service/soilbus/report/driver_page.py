@@ -26,12 +26,9 @@ def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     verdict = dashboard.verdict()
     lines = band(verdict, width, height // 3)
     lines.append(Text(verdict.todo.center(width).rstrip(), style="bold"))
-    is_roomy = height > LEAST_HEIGHT + 4
-    lines += [Text()] if is_roomy else []
-    lines += _slip(dashboard, width, max(height // 16, 1))
-    lines += [Text()] if is_roomy else []
-    lines += _draft(dashboard, width, height - len(lines) - 1)
-    return [*lines, footer(dashboard, width)]
+    space = [Text()] * (height > LEAST_HEIGHT + 4)
+    lines += [*space, *_slip(dashboard, width, max(height // 16, 1)), *space]
+    return [*lines, *_draft(dashboard, width, height - len(lines) - 1), footer(dashboard, width)]
 
 
 def small_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:

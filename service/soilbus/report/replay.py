@@ -77,10 +77,8 @@ def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
     pressures = [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in used if r.bearing is not None]
     if pressures:
         value, std = np.array(pressures).T
-        yield (
-            f"The ground carried {_range(value, 'kPa')} (bearing pressure, in each window known to about "
-            f"± {2.0 * float(np.median(std)):.2g} kPa{doubtful})."
-        )
+        about = f"bearing pressure, in each window known to about ± {2.0 * float(np.median(std)):.2g} kPa{doubtful}"
+        yield f"The ground carried {_range(value, 'kPa')} ({about})."
     drafts = [d.value / 1e3 for r in used if (d := r.traversability.max_draft) is not None]
     pulled = [r.excitation.draft / 1e3 for r in results if r.excitation.draft is not None]
     if drafts:

@@ -236,17 +236,14 @@ def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
         for state, look in STATES.items():
             here = at[[r.traversability.state is state for r in placed]]
             if len(here):
-                axis.scatter(
-                    *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
-                )
+                shown = {"c": look.colour, "marker": look.marker, "label": look.name}
+                axis.scatter(*here.T, s=34, edgecolors="0.25", linewidths=0.5, **shown)
         axis.legend(loc="best")
         axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
         axis.set_aspect("equal", adjustable="datalim")
         axis.margins(0.08)
-        place = ", ".join(
-            f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
-            for i, angle in enumerate(first)
-        )
+        sides = zip(first, ("SN", "WE"), strict=True)
+        place = ", ".join(f"{abs(math.degrees(angle)):.5f}° {side[angle >= 0]}" for angle, side in sides)
         axis.set_xlabel(f"m east of the start ({place})")
         axis.set_ylabel("m north")
 

@@ -151,16 +151,8 @@ class _Place:
 def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
     """Drive the configured vehicle through one realisation of a scenario, which the seed picks.
 
-    Effects are those of config.model.effects and `effects`.
-
-    Raises
-    ------
-    SimulationError
-        There is no vehicle, it cannot even start, or it shall tow what it never tows.
-    KeyError
-        A soil is unknown.
-    ConfigError
-        An effect cannot be.
+    Effects are those of config.model.effects and `effects`. SimulationError where there is no vehicle, it cannot even
+    start, or shall tow what it never tows; KeyError for an unknown soil; ConfigError for an effect that cannot be.
     """
     step = math.inf if scenario.lifted else STEP
     return joined(list(steps(config, scenario, seed, effects, step)))

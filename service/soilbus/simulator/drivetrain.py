@@ -73,17 +73,10 @@ def own_motors(limit: Sequence[float] | Array) -> Drivetrain:
 def drivetrain_of(config: Config) -> Drivetrain:
     """Return the drive line that the configuration describes.
 
-    Parameters
-    ----------
-    config
-        An [[axle]] with a torque, a motor's speed, a limit or a differential drives its wheels together, `both` those
-        of both axles; so does one signal of torque or speed that is mapped for several wheels. Every other driven
-        wheel has a motor of its own.
-
-    Returns
-    -------
-    Couplings are those of `differential` of each axle and of `both`, open on an axle and locked between the axles
-    where it is not given. Wheels on one signal of speed turn together.
+    An [[axle]] with a torque, a motor's speed, a limit or a differential drives its wheels together, `both` those of
+    both axles; so does one signal of torque or speed that is mapped for several wheels. Every other driven wheel has a
+    motor of its own. Couplings are those of `differential` of each axle and of `both`, open on an axle and locked
+    between the axles where it is not given. Wheels on one signal of speed turn together.
     """
     wheels = config.wheel
     n = len(wheels)
@@ -105,16 +98,9 @@ def drivetrain_of(config: Config) -> Drivetrain:
             for side, sign in ((one, 1.0), (other, -1.0)):
                 speed[row, side] = sign * per_turn[side] / len(side) / per_turn[group].mean()
                 torque[row, side] = sign / ratio[side] * ratio[group].mean()
-    limited, limit = _limits_of_axles(config, ratio)
-    return Drivetrain(
-        speed,
-        torque,
-        bias,
-        is_motor,
-        leader,
-        np.concatenate([np.eye(n), limited]),
-        np.concatenate([drive.limit, limit]),
-    )
+    weights, limits = _limits_of_axles(config, ratio)
+    limited, limit = np.concatenate([np.eye(n), weights]), np.concatenate([drive.limit, limits])
+    return Drivetrain(speed, torque, bias, is_motor, leader, limited, limit)
 
 
 def _groups(config: Config) -> list[list[int]]:

@@ -49,13 +49,7 @@ def frames(
     """Yield the recording's frames in the order of their stamps, the first instant at `start` [s].
 
     Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
-
-    Raises
-    ------
-    ConfigError
-        As `channels_of`.
-    ValueError
-        A mapped message cannot be encoded.
+    ConfigError as `channels_of`, ValueError where a mapped message cannot be encoded.
     """
     encoder = Encoder(config, recording.seed, database, start)
     yield from encoder.frames(recording.channels, recording.truth)
@@ -158,10 +152,7 @@ def _unmapped_signals(
 def _raw_codes(
     message: Message, channels: list[Channel], values: Mapping[str, Array], n_frames: int, sent: int
 ) -> dict[str, NDArray[np.int64]]:
-    codes: dict[str, NDArray[np.int64]] = {}
-    for signal in message.signals:
-        if signal.name in values:
-            codes[signal.name] = ValueCodes(signal).column(values[signal.name])
+    codes = {s.name: ValueCodes(s).column(values[s.name]) for s in message.signals if s.name in values}
     for channel in channels:
         if channel.valid_signal is not None and channel.valid_values:
             codes[channel.valid_signal] = np.full(n_frames, channel.valid_values[0])

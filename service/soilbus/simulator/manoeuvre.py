@@ -24,12 +24,8 @@ GAP = 1.0
 LARGEST = 1 << 22
 """Bytes of a file that may be a manoeuvre."""
 RANGES = {
-    "t": (0.0, 86_400.0),
-    "slip": (-1.0, 1.0),
-    "speed": (0.05, 20.0),
-    "side_load": (-1.0, 1.0),
-    "slope": (-0.6, 0.6),
-}
+    "t": (0.0, 86_400.0), "slip": (-1.0, 1.0), "speed": (0.05, 20.0), "side_load": (-1.0, 1.0), "slope": (-0.6, 0.6),
+}  # fmt: skip
 """What a table from a file may hold: a day, what slip and a moved share of a load are, slopes that `--slope` takes."""
 
 

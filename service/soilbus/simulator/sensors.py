@@ -63,21 +63,14 @@ class Sensor(NamedTuple):
 
 def sensors(config: Config) -> Iterator[Sensor]:
     """Yield every sensor that the configuration maps, in the order of its channels."""
-    seen: set[tuple[str, str]] = set()
     for wheel in config.wheel:
         for quantity in WHEEL_ROLES:
             mapped = getattr(wheel, quantity)
-            shared = quantity in SHARED_ROLES
-            if mapped is not None and not (shared and (quantity, mapped.signal) in seen):
-                seen.add((quantity, mapped.signal))
-                same = [
-                    w.name
-                    for w in config.wheel
-                    if getattr(w, quantity) and getattr(w, quantity).signal == mapped.signal
-                ]
-                yield Sensor(
-                    quantity, wheel.name, mapped, dict.fromkeys(same, 1.0 / len(same)) if shared else {wheel.name: 1.0}
-                )
+            same = [wheel.name]
+            if mapped is not None and quantity in SHARED_ROLES:
+                same = next([w.name for w in of] for of in config.same_signal(quantity) if wheel in of)
+            if mapped is not None and same[0] == wheel.name:
+                yield Sensor(quantity, wheel.name, mapped, dict.fromkeys(same, 1.0 / len(same)))
     for axle in config.axle:
         for role, quantity in AXLE_ROLES.items():
             if (mapped := getattr(axle, role)) is not None:

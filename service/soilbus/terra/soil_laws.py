@@ -13,14 +13,9 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "SHEAR_LAWS",
-    "ShearLaw",
-    "exponential_shear",
-    "lumped_modulus",
-    "normal_stress",
-    "rational_shear",
+    "SHEAR_LAWS", "ShearLaw", "exponential_shear", "lumped_modulus", "normal_stress", "rational_shear",
     "shear_displacement",
-]
+]  # fmt: skip
 
 ShearLaw = Callable[[Any], tuple[Any, Any]]
 """Shear displacement over K -> mobilised share of the strength, and its derivative."""

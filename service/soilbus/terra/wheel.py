@@ -35,20 +35,9 @@ from soilbus.terra.track import track_forces, track_forces_and_jacobian, track_f
 from soilbus.terra.wheel_state import EXACT_NODES, FAST_NODES, WheelModel, WheelState
 
 __all__ = [
-    "EXACT_NODES",
-    "FAST_NODES",
-    "FORCES",
-    "INPUTS",
-    "SHAPE",
-    "Soil",
-    "WheelModel",
-    "WheelState",
-    "sinkage",
-    "state_on",
-    "wheel_forces",
-    "wheel_forces_and_derivatives",
-    "wheel_forces_and_slopes",
-]
+    "EXACT_NODES", "FAST_NODES", "FORCES", "INPUTS", "SHAPE", "Soil", "WheelModel", "WheelState", "sinkage", "state_on",
+    "wheel_forces", "wheel_forces_and_derivatives", "wheel_forces_and_slopes",
+]  # fmt: skip
 
 MIN_ENTRY_ANGLE = 1e-4
 MAX_ENTRY_ANGLE = 1.4
