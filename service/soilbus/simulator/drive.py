@@ -68,23 +68,12 @@ class SimulationError(WorkError):
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """True values of a drive.
+    """True values of a drive, with the effects that acted, what these may depend on (N, W), and mass and geometry.
 
-    Attributes
-    ----------
-    columns
-        By name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track), latitude,
-        longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
-        entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of
-        its own motor; nan: unknown).
-    bogged_at
-        Time [s] at which no slip lets the tractor go on and the drive ends; None without.
-    effects
-        Effects that acted.
-    surroundings
-        What these may depend on (N, W).
-    chassis
-        Mass and geometry as they were.
+    columns by name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track),
+    latitude, longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
+    entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of its
+    own motor; nan: unknown).  bogged_at [s]: when no slip lets the tractor go on and the drive ends; None without.
     """
 
     columns: dict[str, NDArray[Any]]

@@ -36,21 +36,11 @@ _OF_DRIVE = {"torque", "torque_limit", "max_torque", "motor_speed", "differentia
 class Drivetrain:
     """Drive line of M wheels: one condition a row, and the torques that are limited.
 
-    Attributes
-    ----------
-    speed
-        (M, M), weights of the rim speeds over the ground speed: of a motor (sum 1), or one side of a coupling less the
-        other; zero for a free wheel.
-    torque
-        (M, M), weights of the torques: one side of a coupling less the other, or a free wheel alone; zero for a motor.
-    bias
-        (M,), of a coupling; 0 in all other rows.
-    is_motor
-        (M,).
-    leader
-        (M,), the wheel whose given deviation from the common slip the wheel shares; -1 for a free wheel.
-    limited, limit
-        (L, M) weights of the torques that have a limit, wheels first, and these limits [N m] (L,); inf for none.
+    speed (M, M): weights of the rim speeds over the ground speed: of a motor (sum 1), or one side of a coupling less
+    the other; zero for a free wheel.  torque (M, M): weights of the torques: one side of a coupling less the other, or
+    a free wheel alone; zero for a motor.  bias (M,): of a coupling, 0 in all other rows; is_motor (M,).  leader (M,):
+    the wheel whose given deviation from the common slip the wheel shares, -1 for a free wheel.  limited (L, M): weights
+    of the torques that have a limit, wheels first; limit (L,): these limits [N m], inf for none.
     """
 
     speed: Array

@@ -102,14 +102,9 @@ def largest_draft(config: Config, soil: str, side: float = 0.0) -> float:
 
     side: share of each axle's load that a side slope moves to its left wheel.
     """
-    rig = rig_of(config)
-    no_limit = np.full(len(rig.radius), np.nan)
-    drivetrain = drivetrain_of(config)
-    drivetrain = replace(drivetrain, limit=np.full_like(drivetrain.limit, np.inf))
-    slip = config.traversability.max_slip
-    return true_largest_draft(
-        soil_named(soil), rig, no_limit, slip, WheelModel(), drivetrain=drivetrain, side_shift=side
-    )
+    rig, line, slip = rig_of(config), drivetrain_of(config), config.traversability.max_slip
+    no_limit, line = np.full(len(rig.radius), np.nan), replace(line, limit=np.full_like(line.limit, np.inf))
+    return true_largest_draft(soil_named(soil), rig, no_limit, slip, WheelModel(), drivetrain=line, side_shift=side)
 
 
 def side_shift(config: Config, soil: str, most: float) -> float:

@@ -48,10 +48,8 @@ def _call_section(found: Reliability) -> Iterator[str]:
         for b in found.bins if b.calls
     ]  # fmt: skip
     yield table(head, rows)
-    yield (
-        f"{found.drives} drives, {found.failed} without a call.  Brier score {found.brier:.4f}, "
-        f"{found.brier_expected:.4f} +- {found.brier_std:.4f} if calibrated;"
-    )
+    brier = f"Brier score {found.brier:.4f}, {found.brier_expected:.4f} +- {found.brier_std:.4f} if calibrated;"
+    yield f"{found.drives} drives, {found.failed} without a call.  {brier}"
     yield f"outcomes less probabilities {found.excess:+.1f} standard deviations; go called {found.go} times, wrongly"
     yield f"{found.wrong_go} times, {found.wrong_go_expected:.2f} expected.  * marks a mean outside its interval."
 
@@ -77,11 +75,9 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     yield table(
         ("without a bogging", "hours", "false warnings"), [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in firm]
     )
-    for name, pooled in _pooled(firm).items():
-        yield (
-            f"{name.capitalize()} drives: {pooled.false} false in {pooled.hours:.2f} h, {pooled.rate:.2f} an hour "
-            f"(95 % interval {pooled.least:.2f} to {pooled.most:.2f})."
-        )
+    for name, of in _pooled(firm).items():
+        rate = f"{of.rate:.2f} an hour (95 % interval {of.least:.2f} to {of.most:.2f})"
+        yield f"{name.capitalize()} drives: {of.false} false in {of.hours:.2f} h, {rate}."
     yield "Target: at most one false warning an hour, on hard drives alone too.  All drives have even seeds: thresholds"
     yield "are set by those of odd seeds alone."
 
