@@ -80,7 +80,7 @@ class SingleWheelRig:
         raw = {
             "wheel": [{"name": "wheel", "radius": self.radius, "width": self.width, "tyre": self.tyre}],
             "table": {role: role for role in ROLES if role in names},
-            "noise": {CHANNELS[name]: _noise(sd) for name, sd in self.noise.items()},
+            "noise": {CHANNELS[n]: sd if isinstance(sd, Mapping) else {"absolute": sd} for n, sd in self.noise.items()},
             "soil": {name: {"value": value, "std": std} for name, (value, std) in self.soil.items()},
             "model": {"shear_law": self.shear_law},
         }
@@ -274,10 +274,6 @@ def _of_bed(runs: Sequence[Run], bed: str | None) -> Run:
     if not len(beds[wanted].window.t):
         raise TableError(f"{SOURCE}: no usable row of the soil bed {wanted} ({', '.join(beds[wanted].rejected)})")
     return beds[wanted]
-
-
-def _noise(sd: float | Mapping[str, float]) -> Mapping[str, float]:
-    return sd if isinstance(sd, Mapping) else {"absolute": sd}
 
 
 def _quantity(found: Estimate, unit: float) -> str:

@@ -186,9 +186,8 @@ class Signal(_Section):
         if self.unsprung_mass and self.effective_area is None:
             raise ValueError("unsprung_mass is for the pressure of air springs: give their effective_area, too")
         if self.torque_constant is not None and self.reference_torque is not None:
-            raise ValueError(
-                "torque_constant is for a current, reference_torque for a percentage: leave out one of the two"
-            )
+            kinds = "torque_constant is for a current, reference_torque for a percentage"
+            raise ValueError(f"{kinds}: leave out one of the two")
         return self
 
     @model_validator(mode="before")
@@ -404,9 +403,8 @@ class Track(RunningGear):
 
     @model_validator(mode="after")
     def _has_radius(self) -> Track:
-        if (self.pitch is None) != (self.sprocket_teeth is None) or (
-            (self.sprocket_radius is None) == (self.pitch is None)
-        ):
+        by_pitch = self.pitch is not None
+        if by_pitch == (self.sprocket_teeth is None) or by_pitch == (self.sprocket_radius is not None):
             raise ValueError(f"track {self.name} needs sprocket_radius, or pitch and sprocket_teeth: one of the two")
         if self.roller_spacing is not None and self.roller_spacing > self.contact_length:
             raise ValueError(f"track {self.name}: roller_spacing is greater than contact_length")

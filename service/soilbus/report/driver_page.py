@@ -84,8 +84,6 @@ def _draft(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     scale = [f"{force(top, top) if top else '':>{AXIS - 2}} ┤", *[f"{'│':>{AXIS}}"] * (rows - 2), f"{'0 ┤':>{AXIS}}"]
     axis = f"{'':{AXIS}}{f'{dashboard.span:.0f} s ago':<{columns - 3}}now"
     legend = "█ draft  ─ possible"
-    return [
-        Text(f"{'DRAFT  ' + '  of possible '.join(dashboard.drafts()):<{width - len(legend)}}{legend}", style="bold"),
-        *(Text(left + right) for left, right in zip(scale, chart, strict=True)),
-        Text(axis),
-    ]
+    title = f"{'DRAFT  ' + '  of possible '.join(dashboard.drafts()):<{width - len(legend)}}{legend}"
+    body = [Text(left + right) for left, right in zip(scale, chart, strict=True)]
+    return [Text(title, style="bold"), *body, Text(axis)]

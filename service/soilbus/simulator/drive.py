@@ -376,8 +376,8 @@ def _situation(
     position = motion.distance + to_cg[:, None]
     soil = soil_along(plan.scenario.soils, position, plan.scenario.transition)
 
-    def each_wheel(values: list[float]) -> Array:
-        return np.broadcast_to(np.array(values)[:, None], shape)
+    def each_wheel(name: str) -> Array:
+        return np.broadcast_to(np.array([getattr(wheel, name) for wheel in wheels])[:, None], shape)
 
     demand, slip_limit, least = plan.demand[part], plan.slip_limit[part], plan.least_draft[part]
     if not lifted:
@@ -388,24 +388,11 @@ def _situation(
     for i, wheel in enumerate(wheels):
         limit[i] = min(limit[i], torque_limit.get(wheel.name, math.inf))
     given = Situation(
-        motion.t,
-        motion.distance,
-        motion.speed,
-        motion.acceleration,
-        pull_required(chassis, 0.0, motion.pitch, motion.acceleration),
-        level,
-        (drawn - level) / test_draft,
-        upright,
-        plan.deviation[:, part],
-        each_wheel([wheel.radius for wheel in wheels]),
-        each_wheel([wheel.width for wheel in wheels]),
-        each_wheel([wheel.contact_length for wheel in wheels]),
-        np.array(soil),
-        demand,
-        slip_limit,
-        np.broadcast_to(limit[:, None], (len(limit), len(motion.t))),
-        least,
-    )
+        motion.t, motion.distance, motion.speed, motion.acceleration,
+        pull_required(chassis, 0.0, motion.pitch, motion.acceleration), level, (drawn - level) / test_draft, upright,
+        plan.deviation[:, part], each_wheel("radius"), each_wheel("width"), each_wheel("contact_length"),
+        np.array(soil), demand, slip_limit, np.broadcast_to(limit[:, None], (len(limit), len(motion.t))), least,
+    )  # fmt: skip
     return _with_resisting_effects(given, plan.mechanics)
 
 
@@ -435,29 +422,18 @@ def _columns(
 ) -> dict[str, NDArray[Any]]:
     latitude, longitude = positions(scenario.course, motion.distance)
     columns: dict[str, NDArray[Any]] = {
-        "t": motion.t,
-        "distance": motion.distance,
-        "ground_speed": motion.speed,
-        "acceleration": motion.acceleration,
-        "pitch": motion.pitch,
-        "latitude": latitude,
-        "longitude": longitude,
-        "draft": result.draft,
+        "t": motion.t, "distance": motion.distance, "ground_speed": motion.speed, "acceleration": motion.acceleration,
+        "pitch": motion.pitch, "latitude": latitude, "longitude": longitude, "draft": result.draft,
         "demand": np.where(np.isfinite(situation.demand), situation.demand, np.nan),
         "soil": np.array(soil_names(scenario.soils, motion.distance)),
-    }
+    }  # fmt: skip
     slip, load = wheel_slips(situation, result), situation.load(result.draft)
     limit = np.where(np.isfinite(situation.torque_limit), situation.torque_limit, np.nan)
     for i, wheel in enumerate(wheels):
         of_wheel = {
-            "slip": slip[i],
-            "entry_angle": result.entry_angle[i],
-            "sinkage": sunk[i],
-            "load": load[i],
-            "drawbar_pull": result.forces[1, i],
-            "torque": result.forces[2, i],
-            "speed": motion.speed / (wheel.radius * (1.0 - slip[i])),
-            "torque_limit": limit[i],
-        }
+            "slip": slip[i], "entry_angle": result.entry_angle[i], "sinkage": sunk[i], "load": load[i],
+            "drawbar_pull": result.forces[1, i], "torque": result.forces[2, i],
+            "speed": motion.speed / (wheel.radius * (1.0 - slip[i])), "torque_limit": limit[i],
+        }  # fmt: skip
         columns |= {f"{quantity}.{wheel.name}": column for quantity, column in of_wheel.items()}
     return columns

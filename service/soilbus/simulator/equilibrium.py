@@ -241,8 +241,7 @@ def _from_scratch(situation: Situation, mechanics: Mechanics) -> Equilibrium:
     concave curve from below without overshooting it.
     """
     slip = np.minimum(0.0 if situation.length.any() else 0.1, situation.slip_limit)
-    drivetrain = mechanics.drivetrain
-    load, model = situation.level_load, mechanics.model
+    drivetrain, load, model = mechanics.drivetrain, situation.level_load, mechanics.model
     lead = np.where((drivetrain.leader < 0)[:, None], -slip, np.zeros_like(load))  # a free wheel begins without slip
     unknown = wheel_state(situation, slip + situation.deviation + lead, np.full_like(load, np.nan))
     angle = entry_angle_for_load(load.ravel(), WheelState(*(np.ravel(a) for a in unknown)), model, tolerance=1e-3)

@@ -139,8 +139,7 @@ def _digging(
 ) -> BoggingDrive:
     """Ground that softens, wheels that dig the deeper the more they slip, and a driver who keeps the throttle.
 
-    Ground speed falls as slip grows: the slips of a first drive at constant speed, metre by
-    metre, give the speed of the second.
+    Ground speed falls as slip grows: slips of a first drive at constant speed, metre by metre, give that of the second.
     """
     length, rim = rng.uniform(15.0, 40.0), rng.uniform(1.2, 1.8)
     slip_sinkage = CATALOGUE["slip_sinkage"]
