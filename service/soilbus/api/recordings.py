@@ -73,11 +73,9 @@ def replay(log: Logs, config: Config | PathLike) -> Any:
     """
     used = _config(config)
     with _paths(log) as paths:
-        if used.table is not None:
-            results = list(replay_tables(used, paths))
-        else:
-            results = list(replay_logs(Pipeline(used, load_databases(used)), paths))
-    rows = [flat_record(window_record(result, used)) for result in results]
+        is_table = used.table is not None
+        found = replay_tables(used, paths) if is_table else replay_logs(Pipeline(used, load_databases(used)), paths)
+        rows = [flat_record(window_record(result, used)) for result in found]
     return rows if find_spec("pandas") is None else frame_of(rows, column_names(rows))
 
 
@@ -123,11 +121,8 @@ class Diagnosis:
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame: probability, value and std of each parameter of the effects found."""
-        rows = [
-            (found["name"], name, parameter["value"], parameter["std"], found["probability"])
-            for found in self.to_dict()["effects"]
-            for name, parameter in found["parameters"].items()
-        ]
+        parts = [(of, name, found) for of in self.to_dict()["effects"] for name, found in of["parameters"].items()]
+        rows = [(of["name"], name, found["value"], found["std"], of["probability"]) for of, name, found in parts]
         return frame_of(rows, ("effect", "parameter", "value", "std", "probability"))
 
     def plot(self) -> Any:

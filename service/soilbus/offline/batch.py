@@ -108,11 +108,8 @@ def run_batch(
         raise ConfigError([f"{names}: fits no log: none of {len(jobs)} logs has a frame that its DBC knows ({first})"])
     summaries = {job.digest: summary for job in jobs if (summary := of_logs[job.digest].summary) is not None}
     windows = {digest: summary["windows.all"] for digest, summary in summaries.items()}
-    errors = [
-        {"vehicle": job.vehicle, "log": job.log, "windows": windows.get(job.digest, 0), "fault": shown(fault)}
-        for job in jobs
-        if (fault := of_logs[job.digest].fault)
-    ]
+    failed = [(job, fault, windows.get(job.digest, 0)) for job in jobs if (fault := of_logs[job.digest].fault)]
+    errors = [{"vehicle": of.vehicle, "log": of.log, "windows": n, "fault": shown(why)} for of, why, n in failed]
     logs = dataset.log_rows(summaries.values())
     vehicles = dataset.vehicle_rows(logs, errors)
     say("tables")

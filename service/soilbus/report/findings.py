@@ -236,12 +236,11 @@ def configured_lines(diagnosis: Diagnosis) -> Iterator[str]:
     fitted = diagnosis.completed.parameters()
     for effect in diagnosis.base.effects:
         priors = diagnosis.base.prior_parameters()[effect.name]
-        found = [
-            f"{name} {value_text(prior.value, prior.std)}{unit}, fitted {value_text(one.value, one.std, AT_EDGE)}{unit}"
-            for name, prior in priors.items()
-            if prior.std > 0.0
-            for one, unit in [(fitted[effect.name][name], _unit_of(name, effect))]
-        ]
+        found = []
+        for name in [name for name, prior in priors.items() if prior.std > 0.0]:
+            prior, one, unit = priors[name], fitted[effect.name][name], _unit_of(name, effect)
+            given = f"{name} {value_text(prior.value, prior.std)}{unit}"
+            found.append(f"{given}, fitted {value_text(one.value, one.std, AT_EDGE)}{unit}")
         if found:
             yield f"in the configuration, {effect.name}: {'; '.join(found)}"
 

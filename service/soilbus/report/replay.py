@@ -32,10 +32,8 @@ def replay_report(results: Sequence[WindowResult], text: str, source: Source) ->
     elif results:
         decision = "May the tractor go on, and how much could it pull?", decision_picture(results, config)
         shown = [decision, *map_pictures(results), *curve_pictures(results, config)]
-    curves = (
-        "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate; its band is"
-        " 95 % wide."
-    )
+    curves = "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate"
+    curves += "; its band is 95 % wide."
     return page(
         "replay.html",
         source,

@@ -188,11 +188,8 @@ def joined(drives: Sequence[Drive]) -> Drive:
 def latest(done: Drive, n: int) -> Drive:
     """Return the last n instants of a drive."""
     around: Any = done.surroundings
-    return replace(
-        done,
-        columns={name: column[-n:] for name, column in done.columns.items()},
-        surroundings=Surroundings(*(a[-n:] if np.ndim(a) > 1 else a for a in around)),
-    )
+    columns = {name: column[-n:] for name, column in done.columns.items()}
+    return replace(done, columns=columns, surroundings=Surroundings(*(a[-n:] if np.ndim(a) > 1 else a for a in around)))
 
 
 def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, ...]) -> _Plan:

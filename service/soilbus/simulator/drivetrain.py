@@ -126,9 +126,7 @@ def _couplings(config: Config, group: Sequence[int]) -> Iterator[tuple[list[int]
 def _bias(axle: Axle | None, otherwise: str) -> float:
     """Greatest difference of the torques over their sum."""
     kind = otherwise if axle is None else axle.differential
-    if kind == "locked" or axle is None or axle.torque_bias is None:
-        return BIAS[kind]
-    return axle.torque_bias
+    return BIAS[kind] if kind == "locked" or axle is None or axle.torque_bias is None else axle.torque_bias
 
 
 def _limits_of_axles(config: Config, ratio: Array) -> tuple[Array, Array]:

@@ -61,10 +61,8 @@ class Encoder:
     def __init__(self, config: Config, seed: int, database: Database | None = None, start: float = START_TIME) -> None:
         database = database if database is not None else load_databases(config)
         self._config, self._start = config, start
-        self._messages = [
-            (database.get_message_by_name(name), channels, channel_rng(seed, name))
-            for name, channels in grouped(channels_of(config, database), lambda channel: channel.message).items()
-        ]
+        mapped = grouped(channels_of(config, database), lambda channel: channel.message).items()
+        self._messages = [(database.get_message_by_name(name), of, channel_rng(seed, name)) for name, of in mapped]
         self._sent: Counter[str] = Counter()
         self._last: dict[str, Column] = {}
 
@@ -91,9 +89,7 @@ class Encoder:
 
 def _after(last: Column | None, column: Column) -> Column:
     """A column with the sample before it, which slower channels hold."""
-    if last is None:
-        return column
-    return Column(np.append(last.t, column.t), np.append(last.value, column.value))
+    return column if last is None else Column(np.append(last.t, column.t), np.append(last.value, column.value))
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:

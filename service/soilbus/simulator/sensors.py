@@ -156,8 +156,7 @@ class Instruments:
         if quantity in POSITION_ROLES:
             parallel = 1.0 if quantity == "latitude" else np.cos(true_columns["latitude"][new])
             return wrapped(truth[new] + POSITION_SD / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(n))
-        noise, window = _noise_of(self._config, sensor), self._config.estimator.window
-        sd = noise_sd(truth, noise, window)[new]
+        sd = noise_sd(truth, _noise_of(self._config, sensor), self._config.estimator.window)[new]
         return np.asarray((1.0 + self._gain[sensor.name]) * truth[new] + sd * rng.standard_normal(n))
 
 
@@ -214,9 +213,8 @@ def _late(drive: Drive, true_columns: dict[str, NDArray[Any]], wheels: list[str]
     changed: dict[str, NDArray[Any]] = {}
     for effect, values in drive.effects:
         for quantity, late in effect.late.items():
-            names = (
-                [f"{quantity}.{wheel}" for wheel in wheels] if f"{quantity}.{wheels[0]}" in true_columns else [quantity]
-            )
+            of_wheels = [f"{quantity}.{wheel}" for wheel in wheels]
+            names = of_wheels if of_wheels[0] in true_columns else [quantity]
             columns = np.stack([changed.get(name, true_columns[name]) for name in names], axis=1)
             changed |= dict(zip(names, read_late(columns, true_columns["t"], values, late).T, strict=True))
     return changed

@@ -223,9 +223,8 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
     np.multiply(at.shear_share, fields[1], out=fields[6])
     np.multiply(mobilising, at.rim.travel, out=fields[7])
     np.multiply(mobilising, at.j_K, out=fields[8])
-    by_normal, deeper, pressed, by_rubbed, by_stuck, turned, rubbed_deeper, by_slip, by_K = integrals(
-        fields, 3, at.rim
-    ).swapaxes(0, 1)
+    parts = integrals(fields, 3, at.rim).swapaxes(0, 1)
+    by_normal, deeper, pressed, by_rubbed, by_stuck, turned, rubbed_deeper, by_slip, by_K = parts
     turned[2] += np.einsum("bmn,bmn->n", at.normal, at.share)
     by_entry, of_slip = _reshaped(at, state, model, tau, mobilising)
     turned += by_entry

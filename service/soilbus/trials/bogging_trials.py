@@ -121,10 +121,8 @@ def trial(task: Task) -> WarningTrial:
 def driven(task: Task) -> tuple[Recording, Drive]:
     """Simulate one drive."""
     config, rng = task.config, np.random.default_rng([task.seed, 3])
-    if task.kind in FIRM_KINDS:
-        trouble = BoggingDrive(firm_ground(config, task.kind, rng))
-    else:
-        trouble = bogging(config, task.kind, rng)
+    is_firm = task.kind in FIRM_KINDS
+    trouble = BoggingDrive(firm_ground(config, task.kind, rng)) if is_firm else bogging(config, task.kind, rng)
     recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
     truth, start = recording.truth, config.estimator.window
     t = truth["t"]

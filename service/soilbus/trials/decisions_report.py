@@ -72,9 +72,8 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     yield f"{lost}, slip passes in less than that and {REACTION_TIME:g} s to react."
     yield ""
     firm = [found for found in warnings if found.hours]
-    yield table(
-        ("without a bogging", "hours", "false warnings"), [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in firm]
-    )
+    false = [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in firm]
+    yield table(("without a bogging", "hours", "false warnings"), false)
     for name, of in _pooled(firm).items():
         rate = f"{of.rate:.2f} an hour (95 % interval {of.least:.2f} to {of.most:.2f})"
         yield f"{name.capitalize()} drives: {of.false} false in {of.hours:.2f} h, {rate}."

@@ -79,9 +79,8 @@ def _multipass(state: WheelState, model: WheelModel, around: Surroundings, value
     strength, power = np.exp(values["density"] * rear), np.exp(-values["reloading"] * rear)
     K_L = TYPICAL_PRESSURE * np.exp(power * np.log(state.K_L / TYPICAL_PRESSURE) + values["stiffness"] * rear)
     K = state.K * np.exp(-values["shear"] * rear)
-    return state._replace(
-        n=power * state.n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K
-    ), model
+    changed = state._replace(n=power * state.n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K)
+    return changed, model
 
 
 MULTIPASS = Effect(
