@@ -194,9 +194,8 @@ def simulate(args: argparse.Namespace) -> None:
     config = with_effects(configured(args, or_reference=True), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
-        scenario = scenario_over(
-            args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
-        )
+        soils, grade = args.soil or ["loam"], args.slope / 100.0
+        scenario = scenario_over(soils, args.duration, way, args.draft, grade, args.speed, args.vehicle_seed)
         if config.tows_nothing and args.slope:
             scenario = replace(scenario, slip=None)  # which would make slopes of its own
         if args.manoeuvre is not None:

@@ -12,26 +12,14 @@ from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.configuration import no_slope
-from soilbus.report.page import Picture, Source, Step, page
-from soilbus.report.replay_pictures import (
-    STATES,
-    clock_text,
-    curve_pictures,
-    decision_picture,
-    map_pictures,
-    run_pictures,
-)
+from soilbus.report.page import Source, Step, page
+from soilbus.report.replay_pictures import STATES, clock_text, pictures
 from soilbus.report.windows import advice, by_reason, machine_line, of_use, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
     """Return the whole page of a replay, with the text of its summary."""
-    config, shown = source.config, list[tuple[str, Picture]]()
-    if results and config.table is not None:
-        shown = list(run_pictures(results))
-    elif results:
-        decision = "May the tractor go on, and how much could it pull?", decision_picture(results, config)
-        shown = [decision, *map_pictures(results), *curve_pictures(results, config)]
+    config, shown = source.config, list(pictures(results, source.config) if results else ())
     curves = "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate"
     curves += "; its band is 95 % wide."
     return page(

@@ -129,6 +129,16 @@ class TimeAxis:
         axis.set_xlabel(f"UTC, {day}" if day else "time of the log, s")
 
 
+def pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
+    """Yield the caption and picture of all that windows show, the decision first; of a test rig, of its runs."""
+    if config.table is not None:
+        yield from run_pictures(results)
+        return
+    yield "May the tractor go on, and how much could it pull?", decision_picture(results, config)
+    yield from map_pictures(results)
+    yield from curve_pictures(results, config)
+
+
 def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture:
     """Return the decision as a ribbon, the estimate's quality below, and the draft beside the largest possible."""
     from matplotlib.patches import Patch
