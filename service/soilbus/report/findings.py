@@ -52,7 +52,9 @@ def findings_json(findings: Findings) -> str:
 
 def findings_record(findings: Findings) -> dict[str, Any]:
     """The same as nested dicts and lists, None for numbers that are not finite."""
-    diagnosis, recordings = findings.diagnosis, findings.recordings
+    diagnosis, recordings, after = findings.diagnosis, findings.recordings, findings.diagnosis.gap_after
+    models = {"before": diagnosis.base, "after": diagnosis.completed}
+    gap = {"before": diagnosis.gap_before.value, "after": after.value, "noise_floor": 1.0, "limit": after.limit()}
     soils = [
         {"log": name, "before": _soil(b, findings), "after": _soil(a, findings)} for name, b, a in findings.soils()
     ]
@@ -62,18 +64,8 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "doubt": doubt(diagnosis),
         "where": [{name: getattr(place, name) for name in PLACE} for place in diagnosis.where],
         "effects": [_effect(addition, diagnosis.completed) for addition in diagnosis.additions],
-        "gap": {
-            "before": diagnosis.gap_before.value,
-            "after": diagnosis.gap_after.value,
-            "noise_floor": 1.0,
-            "limit": diagnosis.gap_after.limit(),
-            "residuals": diagnosis.gap_after.rows,
-            "open": diagnosis.gap_after.exceeds_noise(),
-        },
-        "solver": {
-            "before": [str(fit.termination) for fit in diagnosis.base.fits],
-            "after": [str(fit.termination) for fit in diagnosis.completed.fits],
-        },
+        "gap": {**gap, "residuals": after.rows, "open": after.exceeds_noise()},
+        "solver": {when: [str(fit.termination) for fit in model.fits] for when, model in models.items()},
         **_shown(findings),
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],

@@ -133,7 +133,7 @@ def as_json(
     drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]
 ) -> dict[str, object]:
     """Return the figures as plain objects; null for what is not a number."""
-    figures: dict[str, object] = known({
+    return dict(known({
         "max_draft": [asdict(of_soil) for of_soil in drafts],
         "calls": asdict(calls),
         "immobilisation": {
@@ -144,5 +144,4 @@ def as_json(
             for w in warnings
         },
         "false_warnings": {name: found._asdict() for name, found in _pooled(warnings).items()},
-    })  # fmt: skip
-    return figures
+    }))  # fmt: skip
