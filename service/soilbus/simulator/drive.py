@@ -214,17 +214,17 @@ def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, 
 
 def _driven(plan: _Plan, part: slice, place: _Place, command: Command) -> tuple[Drive, _Place]:
     """One step, and where the next one begins."""
-    draft = None if plan.mechanics.climbs else command.draft
-    lifted = draft is None and plan.scenario.lifted
     wanted = None if command.speed is None else max(command.speed, LEAST_SPEED)
+    command = replace(command, draft=None if plan.mechanics.climbs else command.draft, speed=wanted)
+    lifted = command.draft is None and plan.scenario.lifted
     motion, end = _motion(plan, part, place, wanted, math.inf)
-    situation = _situation(plan, part, motion, draft, lifted, wanted, command.torque_limit)
+    situation = _situation(plan, part, motion, command, lifted)
     result = solve(situation, plan.mechanics, place.last)
     lacking = 0.0 if lifted else float(np.mean(situation.demand - result.draft))
     if lacking > 1e-6 * plan.chassis.mass * GRAVITY:
         possible = float(motion.acceleration.mean()) - lacking / plan.chassis.mass
         motion, end = _motion(plan, part, place, wanted, possible)
-        situation = _situation(plan, part, motion, draft, lifted, wanted, command.torque_limit)
+        situation = _situation(plan, part, motion, command, lifted)
         result = solve(situation, plan.mechanics, result)
     lost = ~result.found if lifted else ~result.found | (situation.slip_limit >= MAX_SLIP)
     stuck = np.flatnonzero(lost)
@@ -341,25 +341,12 @@ def _roll(config: Config, side: Array) -> Array:
     return np.asarray(-np.arcsin(side * config.vehicle.track / (2.0 * config.vehicle.cg_height)))
 
 
-def _situation(
-    plan: _Plan,
-    part: slice,
-    motion: _Motion,
-    draft: float | None,
-    lifted: bool,
-    wanted: float | None,
-    torque_limit: Mapping[str, float],
-) -> Situation:
-    """What is given in a step, with the forces of effects that resist.
-
-    Draft [N] and wanted speed [m/s] are None as the scenario has them; with `lifted` the driver lifts the implement at
-    his slip limit.
-    """
+def _situation(plan: _Plan, part: slice, motion: _Motion, command: Command, lifted: bool) -> Situation:
+    """What is given in a step, with the forces of effects that resist; `lifted`: the driver lifts at his slip limit."""
     chassis, wheels, drivetrain = plan.chassis, plan.config.wheel, plan.mechanics.drivetrain
     climbs, side = plan.mechanics.climbs, plan.side[part]
     shape = (len(wheels), len(motion.t))
     share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))]) * (1.0 + plan.bounce[:, part])
-
     ahead = _ahead(plan.config)
 
     def loads(draft: float, inertia: float = 0.0) -> Array:
@@ -378,12 +365,13 @@ def _situation(
 
     demand, slip_limit, least = plan.demand[part], plan.slip_limit[part], plan.least_draft[part]
     if not lifted:
-        rim = RIM_SPEED_RATIO * np.maximum(plan.speed.value[part] if wanted is None else wanted, motion.speed)
-        demand = demand if draft is None else np.full(shape[1], draft)
+        wanted = plan.speed.value[part] if command.speed is None else command.speed
+        rim = RIM_SPEED_RATIO * np.maximum(wanted, motion.speed)
+        demand = demand if command.draft is None else np.full(shape[1], command.draft)
         slip_limit, least = np.minimum(1.0 - motion.speed / rim, MAX_SLIP), np.full(shape[1], -np.inf)
     limit = drivetrain.limit.copy()
     for i, wheel in enumerate(wheels):
-        limit[i] = min(limit[i], torque_limit.get(wheel.name, math.inf))
+        limit[i] = min(limit[i], command.torque_limit.get(wheel.name, math.inf))
     given = Situation(
         motion.t, motion.distance, motion.speed, motion.acceleration,
         pull_required(chassis, 0.0, motion.pitch, motion.acceleration), level, (drawn - level) / test_draft, upright,
