@@ -190,7 +190,6 @@ class _Unpacked(io.RawIOBase):
 
 _MARKS = {"gzip": b"\x1f\x8b", "bzip2": b"BZh", "xz": b"\xfd7zXZ\0", "zstd": b"\x28\xb5\x2f\xfd"}
 
-
 _numbers = count()
 
 

@@ -19,7 +19,7 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
-from soilbus.simulator.sensors import true_readings
+from soilbus.simulator.sensors import sensors, straight_on, true_reading
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.trials import windows as service_windows
@@ -129,5 +129,6 @@ def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") 
 def exact(recording: Recording, config: Config, names: Iterable[str]) -> dict[str, Column]:
     """What sensors without errors and effects would have read at the times of these channels' samples."""
     truth, times = recording.truth, {name: recording.channels[name].t for name in names}
-    readings = true_readings(truth, config, times)
+    columns, of_channel = truth | straight_on(truth, config), {sensor.name: sensor for sensor in sensors(config)}
+    readings = {name: true_reading(columns, of_channel[name].quantity, of_channel[name].weight) for name in times}
     return {name: Column(t, np.interp(t, truth["t"], readings[name])) for name, t in times.items()}

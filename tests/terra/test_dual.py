@@ -60,11 +60,6 @@ def test_comparisons_are_of_values():
     assert value_of(Dual(X, {})) is X is value_of(X)
 
 
-def test_derivatives_of_one_kind():
-    both = Dual(X, {"x": UNIT, 3: 2.0})
-    assert both.only(int).by == {3: 2.0}
-
-
 @pytest.mark.parametrize("function", [np.sinh, np.add.reduce, lambda x: np.add(x, 1.0, out=np.zeros(3))])
 def test_functions_it_does_not_know_are_refused(function):
     with pytest.raises(TypeError):

@@ -80,7 +80,7 @@ class SingleWheelRig:
         raw = {
             "wheel": [{"name": "wheel", "radius": self.radius, "width": self.width, "tyre": self.tyre}],
             "table": {role: role for role in ROLES if role in names},
-            "noise": {CHANNELS[name]: _noise(sd) for name, sd in self.noise.items()},
+            "noise": {CHANNELS[n]: sd if isinstance(sd, Mapping) else {"absolute": sd} for n, sd in self.noise.items()},
             "soil": {name: {"value": value, "std": std} for name, (value, std) in self.soil.items()},
             "model": {"shear_law": self.shear_law},
         }
@@ -211,10 +211,8 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     lengths = {len(cells) for cells in columns.values() if isinstance(cells, list)}
     if len(lengths) > 1 or not all(isinstance(cells, list) for cells in columns.values()):
         raise TableError(f"{SOURCE}: its columns are not of one length")
-    if isinstance(rig, SingleWheelRig):
-        config = rig.configuration(columns)
-    else:
-        config = rig if isinstance(rig, Config) else load_config(rig)
+    given = rig.configuration(columns) if isinstance(rig, SingleWheelRig) else rig
+    config = given if isinstance(given, Config) else load_config(given)
     found = _of_bed(runs_of_columns(config, columns, SOURCE), run)
     (result,) = replay_runs(config, [found])
     bearing = result.bearing
@@ -238,21 +236,13 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
 
 def _readings(config: Config, found: Run, soil: Soil) -> list[dict[str, Any]]:
     """Each channel's rows beside the model's values; the wheel runs with the configured effects."""
-    window, wheel = found.window, config.wheel[0]
+    window, wheel, model = found.window, config.wheel[0], model_of(config)
     load, slip = window.load[:, 0], slip_ratio(wheel.radius, window.speed[:, 0], window.ground_speed)
-    effects = {
-        f"{effect.name}.{name}": given["value"] if isinstance(given, Mapping) else given
-        for effect in config.model.effects
-        for name, given in (effect.model_extra or {}).items()
-    }
-    modelled = wheel_forces(
-        soil, load, slip, radius=wheel.radius, width=wheel.width, model=model_of(config), effects=effects or None
-    )
-    both = {
-        "drawbar_pull": (window.draft, modelled.drawbar_pull),
-        "torque": (window.torque[:, 0], modelled.torque),
-        "sinkage": (window.sinkage[:, 0], modelled.sinkage),
-    }
+    given = {f"{e.name}.{name}": value for e in config.model.effects for name, value in (e.model_extra or {}).items()}
+    effects = {name: value["value"] if isinstance(value, Mapping) else value for name, value in given.items()}
+    of = wheel_forces(soil, load, slip, radius=wheel.radius, width=wheel.width, model=model, effects=effects or None)
+    both = {"drawbar_pull": (window.draft, of.drawbar_pull), "torque": (window.torque[:, 0], of.torque)}
+    both["sinkage"] = window.sinkage[:, 0], of.sinkage
     return [
         {"channel": channel, "slip": s, "load": w, "measured": y, "modelled": m, "residual": y - m}
         for channel, (measured, values) in both.items()
@@ -274,10 +264,6 @@ def _of_bed(runs: Sequence[Run], bed: str | None) -> Run:
     if not len(beds[wanted].window.t):
         raise TableError(f"{SOURCE}: no usable row of the soil bed {wanted} ({', '.join(beds[wanted].rejected)})")
     return beds[wanted]
-
-
-def _noise(sd: float | Mapping[str, float]) -> Mapping[str, float]:
-    return sd if isinstance(sd, Mapping) else {"absolute": sd}
 
 
 def _quantity(found: Estimate, unit: float) -> str:

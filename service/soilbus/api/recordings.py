@@ -73,14 +73,10 @@ def replay(log: Logs, config: Config | PathLike) -> Any:
     """
     used = _config(config)
     with _paths(log) as paths:
-        if used.table is not None:
-            results = list(replay_tables(used, paths))
-        else:
-            results = list(replay_logs(Pipeline(used, load_databases(used)), paths))
-    rows = [flat_record(window_record(result, used)) for result in results]
-    if find_spec("pandas") is None:
-        return rows
-    return frame_of(rows, column_names(rows))
+        is_table = used.table is not None
+        found = replay_tables(used, paths) if is_table else replay_logs(Pipeline(used, load_databases(used)), paths)
+        rows = [flat_record(window_record(result, used)) for result in found]
+    return rows if find_spec("pandas") is None else frame_of(rows, column_names(rows))
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,11 +121,8 @@ class Diagnosis:
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame: probability, value and std of each parameter of the effects found."""
-        rows = [
-            (found["name"], name, parameter["value"], parameter["std"], found["probability"])
-            for found in self.to_dict()["effects"]
-            for name, parameter in found["parameters"].items()
-        ]
+        parts = [(of, name, found) for of in self.to_dict()["effects"] for name, found in of["parameters"].items()]
+        rows = [(of["name"], name, found["value"], found["std"], of["probability"]) for of, name, found in parts]
         return frame_of(rows, ("effect", "parameter", "value", "std", "probability"))
 
     def plot(self) -> Any:
@@ -153,8 +146,7 @@ class Diagnosis:
             raise ValueError("diagnose() was given a configuration without its file: give the path of the TOML file")
         out = Path(out)
         effects, notes = effect_tables(self.findings.diagnosis.completed)
-        text = with_effects_text(self.path, [], effects, out.parent, notes)
-        write_text(out, text)
+        write_text(out, with_effects_text(self.path, [], effects, out.parent, notes))
 
 
 def diagnose(logs: Logs, config: Config | PathLike) -> Diagnosis:

@@ -114,7 +114,8 @@ def wheel_forces(
     wheel = Wheel(radius, width, False, np.asarray(np.nan if load is None else load, float))
     forces = completed.forces(state, False, wheel.load)
     angle = np.broadcast_to(state.entry_angle, forces.shape[1:])
-    return WheelForces(*(_plain(a) for a in (*forces, angle, completed.sinkage(angle, wheel))))
+    found = (*forces, angle, completed.sinkage(angle, wheel))
+    return WheelForces(*(values if np.ndim(values) else float(values) for values in found))
 
 
 def _active(effects: Mapping[str, float]) -> list[Active]:
@@ -177,8 +178,3 @@ def _entry_angle(sinkage: Any, radius: Any) -> Any:
     if np.any((sinkage <= 0.0) | (sinkage >= radius * deepest)):
         raise ValueError(f"the sinkage must be above 0 and below {deepest:.2f} of the radius")
     return np.arccos(1.0 - sinkage / radius)
-
-
-def _plain(values: Any) -> Any:
-    """A float of an array without dimensions."""
-    return values if np.ndim(values) else float(values)

@@ -3,14 +3,7 @@
 from __future__ import annotations
 
 import math
-from argparse import (
-    Action,
-    ArgumentParser,
-    ArgumentTypeError,
-    Namespace,
-    RawDescriptionHelpFormatter,
-    _SubParsersAction,
-)
+from argparse import Action, ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter, _SubParsersAction
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -51,7 +44,7 @@ class _Parser(ArgumentParser):
 class Once(Action):
     """Action that keeps the value of an option that may stand once; argparse would drop the first of two."""
 
-    def __call__(self, parser: ArgumentParser, namespace: Namespace, values: Any, option_string: Any = None) -> None:
+    def __call__(self, parser: ArgumentParser, namespace: Any, values: Any, option_string: Any = None) -> None:
         """Set the value; the parser's error where the option has one already."""
         given: set[str] = vars(namespace).setdefault("given", set())
         if self.dest in given:
@@ -142,9 +135,8 @@ def command_line() -> ArgumentParser:
     _file(source, "--table", "LOG", "in place of DBC and log: decoded signals over time (CSV, Parquet, MF4)")
     _file(sub, "--log", "LOG", "a drive with varied load, to see what each signal does")
     _channel(sub)
-    sub.add_argument(
-        "-o", "--out", type=Path, default=Path("-"), metavar="OUT.toml", help="file to write (default: stdout)"
-    )
+    text = "file to write (default: stdout)"
+    sub.add_argument("-o", "--out", type=Path, default=Path("-"), metavar="OUT.toml", help=text)
     _flag(sub, "--force", "replace a file that is there already")
 
     sub = command("run", "the service on a live bus", FOUND)

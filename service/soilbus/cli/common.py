@@ -16,17 +16,14 @@ from soilbus.files import write_text
 from soilbus.words import WorkError
 
 
-def configured(args: argparse.Namespace) -> Config:
-    """Return the configuration that --config and --set name, or soilbus.toml in the current folder."""
+def configured(args: argparse.Namespace, or_reference: bool = False) -> Config:
+    """Return the configuration of --config and --set; by default soilbus.toml here, or our reference tractor."""
+    if or_reference and not args.config:
+        from soilbus.simulator.reference import reference_configuration
+
+        return reference_configuration(args.set)
     config = load_config(found_configuration(args.config), args.set)
     return config.model_copy(update={"log_channel": getattr(args, "channel", None)})
-
-
-def configured_or_reference(args: argparse.Namespace) -> Config:
-    """Return the configuration that --config and --set name, or that of our reference tractor."""
-    from soilbus.simulator.reference import reference_configuration
-
-    return configured(args) if args.config else reference_configuration(args.set)
 
 
 def need_extra(extra: str, what: str, *modules: str) -> None:

@@ -51,8 +51,7 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
 
     `picture` is where the last state of the dashboard is kept as SVG; the engineer's page has `-engineer` in its name.
     """
-    console = Console()
-    real = reference_configuration()
+    console, real = Console(), reference_configuration()
     recording = simulate(real, demo_scenario(duration), SEED)
     results: list[WindowResult] = []
     logging.getLogger("soilbus").setLevel(logging.ERROR)  # the dashboard shows what the journal would say
@@ -60,8 +59,7 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
         where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
         console.print(f"Simulated tractor on {where}: loam, then wet clay; {SPEED:.0f} times as fast as real time.")
         config = reference_configuration(overrides)
-        ours = output_database(config)
-        bus = config.bus.model_dump()
+        ours, bus = output_database(config), config.bus.model_dump()
         with open_bus(bus, []) as tractor, open_bus(bus, []) as node, open_bus(bus, filters_of(ours)) as ear:
             drive = _Drive(list(frames(_every_second(recording), real)), tractor, ear)
 
@@ -139,17 +137,16 @@ def _ip(*words: str) -> bool:
 
 def _svg(shown: Group) -> str:
     """A page as SVG that asks for no font from elsewhere."""
-    paper = Console(
-        record=True, file=io.StringIO(), width=PICTURE_SIZE[0], force_terminal=True, color_system="truecolor"
-    )
+    out, width = io.StringIO(), PICTURE_SIZE[0]
+    paper = Console(record=True, file=out, width=width, force_terminal=True, color_system="truecolor")
     paper.print(shown)
     return re.sub(r"@font-face \{.*?\}\s*", "", paper.export_svg(title="soilbus watch"), flags=re.DOTALL)
 
 
 def _story(results: list[WindowResult]) -> str:
     """The windows some seconds apart, as a table."""
-    rows, due = [], results[0].t if results else 0.0
-    begin = due
+    rows, begin = [], results[0].t if results else 0.0
+    due = begin
     for r in results:
         if r.t + 1e-6 < due:
             continue

@@ -30,9 +30,8 @@ def effects(args: argparse.Namespace) -> None:
 
 def parameter_rows(effect: Effect) -> list[tuple[str, ...]]:
     """Return each parameter of an effect: name, unit, value at which the effect is absent, prior std, range."""
-    return [
-        (p.name, p.unit or "–", f"{p.neutral:g}", f"{p.std:g}", f"{p.low:g} to {p.high:g}") for p in effect.parameters
-    ]
+    of = effect.parameters
+    return [(p.name, p.unit or "–", f"{p.neutral:g}", f"{p.std:g}", f"{p.low:g} to {p.high:g}") for p in of]
 
 
 def effect_text(effect: Effect) -> str:
@@ -51,16 +50,12 @@ def overview(effects: Iterable[Effect]) -> str:
 
 def effect_records(effects: Iterable[Effect]) -> list[dict[str, Any]]:
     """Return all that the catalogue says of effects, for JSON."""
-    return [
-        {
-            "name": effect.name,
-            "physics": effect.physics,
-            "parameters": [
-                {"name": p.name, "unit": p.unit, "absent_at": p.neutral, "std": p.std, "range": [p.low, p.high]}
-                for p in effect.parameters
-            ],
-            "shown_by": effect.tells,
-            "source": effect.source,
-        }
-        for effect in effects
-    ]
+    records = []
+    for of in effects:
+        parameters = [
+            {"name": p.name, "unit": p.unit, "absent_at": p.neutral, "std": p.std, "range": [p.low, p.high]}
+            for p in of.parameters
+        ]
+        head = {"name": of.name, "physics": of.physics, "parameters": parameters}
+        records.append({**head, "shown_by": of.tells, "source": of.source})
+    return records

@@ -17,14 +17,7 @@ from pathlib import Path
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
-from soilbus.cli.common import (
-    check_log_to_write,
-    check_outputs,
-    configured,
-    configured_or_reference,
-    need_extra,
-    reading_or_writing,
-)
+from soilbus.cli.common import check_log_to_write, check_outputs, configured, need_extra, reading_or_writing
 from soilbus.config.edit import with_effects_text
 from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config, ConfigError
@@ -198,12 +191,11 @@ def simulate(args: argparse.Namespace) -> None:
     check_outputs(args.truth, args.log)
     if args.truth is not None and args.truth.suffix == ".parquet":
         need_extra("tables", "--truth OUT.parquet", "pyarrow")
-    config = with_effects(configured_or_reference(args), args.effect)
+    config = with_effects(configured(args, or_reference=True), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
-        scenario = scenario_over(
-            args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
-        )
+        soils, grade = args.soil or ["loam"], args.slope / 100.0
+        scenario = scenario_over(soils, args.duration, way, args.draft, grade, args.speed, args.vehicle_seed)
         if config.tows_nothing and args.slope:
             scenario = replace(scenario, slip=None)  # which would make slopes of its own
         if args.manoeuvre is not None:

@@ -9,7 +9,7 @@ import argparse
 import os
 from contextlib import nullcontext
 
-from soilbus.cli.common import configured_or_reference, report
+from soilbus.cli.common import configured, report
 from soilbus.config.model import ConfigError
 from soilbus.files import whole_file
 from soilbus.words import WorkError
@@ -30,7 +30,7 @@ def decisions(args: argparse.Namespace) -> None:
     from soilbus.trials.draws import processes
     from soilbus.trials.verdict_trials import verdict_trials
 
-    config = configured_or_reference(args)
+    config = configured(args, or_reference=True)
     if config.tows_nothing:
         raise ConfigError(['vehicle.towing = "never": decisions are tried by drafts, which this vehicle never has'])
     with processes(os.cpu_count() or 1) as each:

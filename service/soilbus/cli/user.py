@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import check_outputs, configured, configured_or_reference, need_extra
+from soilbus.cli.common import check_outputs, configured, need_extra
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import write_text
 from soilbus.process import ENDING, say
@@ -200,7 +200,7 @@ def watch(args: argparse.Namespace) -> None:
         if args.log is not None:
             raise ConfigError([f"--channel {args.channel}: {args.log} is a recording, which has no bus"])
         args.set.append(f"bus.channel={json.dumps(args.channel)}")
-    config, is_named = configured_or_reference(args), args.config is not None
+    config, is_named = configured(args, or_reference=True), args.config is not None
     watch(config, args.log, args.speed, is_named, args.seconds, args.plain, args.json)
 
 

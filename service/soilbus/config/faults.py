@@ -68,10 +68,6 @@ def _text(error: Any) -> str:
         return str(error["msg"]).removeprefix("Value error, ")
     if kind == "extra_forbidden":
         return _unknown_key(error["loc"])
-    if kind == "missing":
-        return "missing"
-    if kind == "string_pattern_mismatch":
-        return f"{_shown(given)} is no name: 1 to 16 letters, digits, - or _"
     if kind == "literal_error":
         known = _choices(error["loc"])
         return f"{_shown(given)} is not one of {', '.join(map(str, known))}{did_you_mean(str(given), map(str, known))}"
@@ -100,10 +96,8 @@ _GONE: Mapping[tuple[Any, ...], str] = {
         "chi-square judges no window any more: remove it; max_prediction_error, a share of torque and pull, judges now"
     ),
     ("estimator", "min_track_load_change"): "windows at a constant load are judged by their widths: remove it",
-    ("mqtt",): (
-        "the service holds no connection to a network: remove this section; soilbus watch --json prints the results"
-        " for mosquitto_pub -l (soilbus docs systemd)"
-    ),
+    ("mqtt",): "the service holds no connection to a network: remove this section; soilbus watch --json prints the"
+    " results for mosquitto_pub -l (soilbus docs systemd)",
 }
 """Keys that earlier versions had, and what to write instead."""
 _REPEATED = ("axle", "wheel", "track")
@@ -124,6 +118,8 @@ _SENTENCES: Mapping[str, Callable[[Any, Mapping[str, Any]], str]] = {
         ("int_type", "int_parsing", "int_from_float", "int_parsing_size"),
         lambda given, _: f"{_shown(given)} is not a whole number",
     ),
+    "missing": lambda given, _: "missing",
+    "string_pattern_mismatch": lambda given, _: f"{_shown(given)} is no name: 1 to 16 letters, digits, - or _",
     "finite_number": lambda given, _: f"{given} is not a number that counts",
     "greater_than": lambda given, c: f"{_shown(given)} is not above {c['gt']:g}",
     "greater_than_equal": lambda given, c: f"{_shown(given)} is less than {c['ge']:g}",
@@ -132,8 +128,7 @@ _SENTENCES: Mapping[str, Callable[[Any, Mapping[str, Any]], str]] = {
     "string_type": lambda given, _: f"{_shown(given)} is not a text in quotes",
     "string_too_short": lambda given, _: "an empty text names nothing",
     "too_long": lambda given, c: f"{c['actual_length']} are too many; at most {c['max_length']}",
-    "bool_type": lambda given, _: f"{_shown(given)} is neither true nor false",
-    "bool_parsing": lambda given, _: f"{_shown(given)} is neither true nor false",
+    **dict.fromkeys(("bool_type", "bool_parsing"), lambda given, _: f"{_shown(given)} is neither true nor false"),
 }
 
 
@@ -165,8 +160,7 @@ def _shown(given: Any) -> str:
 
 def _named(raw: Any, location: Sequence[Any]) -> list[str]:
     """The steps of a location as they are written in the file: list items by name, else counted from 1."""
-    steps: list[str] = []
-    here = raw
+    steps, here = list[str](), raw
     for part in location:
         try:
             here = here[part]

@@ -186,9 +186,8 @@ class Signal(_Section):
         if self.unsprung_mass and self.effective_area is None:
             raise ValueError("unsprung_mass is for the pressure of air springs: give their effective_area, too")
         if self.torque_constant is not None and self.reference_torque is not None:
-            raise ValueError(
-                "torque_constant is for a current, reference_torque for a percentage: leave out one of the two"
-            )
+            kinds = "torque_constant is for a current, reference_torque for a percentage"
+            raise ValueError(f"{kinds}: leave out one of the two")
         return self
 
     @model_validator(mode="before")
@@ -404,9 +403,8 @@ class Track(RunningGear):
 
     @model_validator(mode="after")
     def _has_radius(self) -> Track:
-        if (self.pitch is None) != (self.sprocket_teeth is None) or (
-            (self.sprocket_radius is None) == (self.pitch is None)
-        ):
+        by_pitch = self.pitch is not None
+        if by_pitch == (self.sprocket_teeth is None) or by_pitch == (self.sprocket_radius is not None):
             raise ValueError(f"track {self.name} needs sprocket_radius, or pitch and sprocket_teeth: one of the two")
         if self.roller_spacing is not None and self.roller_spacing > self.contact_length:
             raise ValueError(f"track {self.name}: roller_spacing is greater than contact_length")
@@ -1007,10 +1005,8 @@ class Config(_Section):
         named = list(dict.fromkeys(["front", "middle", "rear", *(a.name for a in self.axle if a.name != "both")]))
         for w in self.wheel:
             if w.axle is not None and w.axle not in named:
-                yield (
-                    f'{w.section}.{w.name}.axle: "{w.axle}" is not one of {", ".join(named)}'
-                    f"{did_you_mean(w.axle, named) or '; an axle of another name needs an [[axle]]'}"
-                )
+                meant = did_you_mean(w.axle, named) or "; an axle of another name needs an [[axle]]"
+                yield f'{w.section}.{w.name}.axle: "{w.axle}" is not one of {", ".join(named)}{meant}'
         yield from self._faults_of_places()
         for axle in self.axle:
             if sum(a.name == axle.name for a in self.axle) > 1:
@@ -1040,18 +1036,15 @@ class Config(_Section):
         if missing := [name for name in between if given and name not in {axle.name for axle in given}]:
             yield f"axle {missing[0]}: ahead_of_rear_axle: missing; give it of each axle between the first and last"
         if any(ahead <= behind for ahead, behind in pairwise(places)):
-            yield (
-                f"the axles {', '.join(self.axles)} must stand from the front to the rear, as their [[axle]] tables do:"
-                " ahead_of_rear_axle must fall from vehicle.wheelbase to 0"
-            )
+            order = "must stand from the front to the rear, as their [[axle]] tables do"
+            yield f"the axles {', '.join(self.axles)} {order}: ahead_of_rear_axle must fall from vehicle.wheelbase to 0"
 
     @model_validator(mode="after")
     def _bins_of_differentials(self) -> Config:
         """The default of `estimator.bin` behind differentials."""
-        shared = [axle for axle in self.axle if axle.torque is not None and axle.differential != "locked"]
-        if (shared or any(len(wheels) > 1 for wheels in self.same_signal("torque"))) and (
-            "bin" not in self.estimator.model_fields_set
-        ):
+        shared = any(axle.torque is not None and axle.differential != "locked" for axle in self.axle)
+        shared |= any(len(wheels) > 1 for wheels in self.same_signal("torque"))
+        if shared and "bin" not in self.estimator.model_fields_set:
             object.__setattr__(self, "estimator", self.estimator.model_copy(update={"bin": SHORT_BIN}))
         return self
 

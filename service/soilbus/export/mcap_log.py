@@ -33,40 +33,27 @@ JSON_TYPES = {"text": "string", "number": "number", "integer": "integer", "truth
 FOXGLOVE_WARNING = 3
 """Level WARNING of foxglove.Log."""
 _TIME = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
-LOCATION_SCHEMA = {
-    "title": "foxglove.LocationFix",
-    "type": "object",
-    "properties": {
-        "timestamp": _TIME,
-        "frame_id": {"type": "string"},
-        "latitude": {"type": "number", "description": "deg, positive north"},
-        "longitude": {"type": "number", "description": "deg, positive east"},
-    },
-    "required": ["timestamp", "latitude", "longitude"],
-}
-LOG_SCHEMA = {
-    "title": "foxglove.Log",
-    "type": "object",
-    "properties": {
-        "timestamp": _TIME,
-        "level": {"type": "integer"},
-        "message": {"type": "string"},
-        "name": {"type": "string"},
-    },
-    "required": ["timestamp", "level", "message"],
-}
+_TEXT = {"type": "string"}
+
+
+def _schema(title: str, optional: str, **properties: dict[str, str]) -> dict[str, Any]:
+    """The JSON schema of a message of Foxglove, of whose properties all but one must be there."""
+    known = {"timestamp": _TIME, **properties}
+    return {"title": title, "type": "object", "properties": known, "required": [n for n in known if n != optional]}
+
+
+LOCATION_SCHEMA = _schema(
+    "foxglove.LocationFix", "frame_id", frame_id=_TEXT,
+    latitude={"type": "number", "description": "deg, positive north"},
+    longitude={"type": "number", "description": "deg, positive east"},
+)  # fmt: skip
+LOG_SCHEMA = _schema("foxglove.Log", "name", level={"type": "integer"}, message=_TEXT, name=_TEXT)
 
 
 def write_mcap(
     path: Path, results: Sequence[WindowResult], config: Config, frames: Iterable[tuple[str, Frame]] = ()
 ) -> None:
-    """Write the windows in the order of their times, and between them frames, each with its channel, in theirs.
-
-    Raises
-    ------
-    NotWritten
-        The file cannot be written.
-    """
+    """Write the windows in the order of their times, and between them frames, each with its channel; NotWritten."""
     from mcap.writer import Writer
 
     records = [_without_unknowns(window_record(result, config)) for result in results]
@@ -74,22 +61,15 @@ def write_mcap(
         writer: Any = Writer(out)
         writer.start(library=f"soilbus {__version__}")
         writer.add_metadata("soilbus", {"version": __version__, "schema": SCHEMA_VERSION})
-        topics = {
-            "/soilbus/window": window_schema(records),
-            "/soilbus/location": LOCATION_SCHEMA,
-            "/soilbus/warning": LOG_SCHEMA,
-            "/can": FRAME_SCHEMA,
-        }
+        topics = {"/soilbus/window": window_schema(records), "/soilbus/location": LOCATION_SCHEMA}
+        topics |= {"/soilbus/warning": LOG_SCHEMA, "/can": FRAME_SCHEMA}
         channels = {}
         for topic, schema in topics.items():
             schema_id = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
             channels[topic] = writer.register_channel(topic, "json", schema_id)
         messages = [m for result, record in zip(results, records, strict=True) for m in _messages(result, record)]
-        logged = (
-            (frame[0], "/can", frame_message(channel, frame))
-            for channel, frame in frames
-            if -LAST_TIME <= frame[0] <= LAST_TIME
-        )
+        timed = ((channel, frame) for channel, frame in frames if -LAST_TIME <= frame[0] <= LAST_TIME)
+        logged = ((frame[0], "/can", frame_message(channel, frame)) for channel, frame in timed)
         in_order = merge(logged, sorted(messages, key=_time_of), key=_time_of)
         for n, (t, topic, message) in enumerate(in_order):
             stamp = max(nanoseconds(t), 0)
@@ -107,18 +87,12 @@ def _messages(result: WindowResult, record: Mapping[str, Any]) -> Iterator[_Mess
     yield result.t, "/soilbus/window", record
     if result.position is not None:
         latitude, longitude = (math.degrees(angle) for angle in result.position)
-        yield (
-            result.t,
-            "/soilbus/location",
-            {"timestamp": _time(result.t), "frame_id": "vehicle", "latitude": latitude, "longitude": longitude},
-        )
+        fix = {"timestamp": _time(result.t), "frame_id": "vehicle", "latitude": latitude, "longitude": longitude}
+        yield result.t, "/soilbus/location", fix
     for t in result.warnings.begun:
         text = "warning of immobilisation: stop, lift the implement or turn off, and do not add torque"
-        yield (
-            t,
-            "/soilbus/warning",
-            {"timestamp": _time(t), "level": FOXGLOVE_WARNING, "message": text, "name": "soilbus"},
-        )
+        warning = {"timestamp": _time(t), "level": FOXGLOVE_WARNING, "message": text, "name": "soilbus"}
+        yield t, "/soilbus/warning", warning
 
 
 def window_schema(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -149,11 +123,8 @@ def _leaf(path: str) -> dict[str, Any]:
 
 def _without_unknowns(record: Mapping[str, Any]) -> dict[str, Any]:
     """The record without its keys of value None."""
-    return {
-        key: _without_unknowns(value) if isinstance(value, Mapping) else value
-        for key, value in record.items()
-        if value is not None
-    }
+    known = ((key, value) for key, value in record.items() if value is not None)
+    return {key: _without_unknowns(value) if isinstance(value, Mapping) else value for key, value in known}
 
 
 def _time(t: float) -> dict[str, int]:

@@ -27,32 +27,18 @@ def check_position_is_mapped(config: Config, option: str) -> None:
 
 
 def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
-    """Return a FeatureCollection, one feature a line.
-
-    Returns
-    -------
-    The text, and the number of windows without a position, which it leaves out.
-    """
-    features: list[str] = []
-    left_out = 0
-    for result in results:
-        if result.position is None:
-            left_out += 1
-        else:
-            features.append(json.dumps(known(_feature(result)), allow_nan=False))
+    """Return a FeatureCollection, one feature a line, and the number of windows left out, which have no position."""
+    every = list(results)
+    features = [json.dumps(known(_feature(r)), allow_nan=False) for r in every if r.position is not None]
     body = ",\n".join(features)
-    return f'{{"type": "FeatureCollection", "features": [\n{body}\n]}}\n', left_out
+    return f'{{"type": "FeatureCollection", "features": [\n{body}\n]}}\n', len(every) - len(features)
 
 
 def _feature(result: WindowResult) -> dict[str, Any]:
     assert result.position is not None
     latitude, longitude = (round(math.degrees(angle), DEGREE_DECIMALS) for angle in result.position)
-    return {
-        "type": "Feature",
-        "id": result.index,
-        "geometry": {"type": "Point", "coordinates": [longitude, latitude]},
-        "properties": _properties(result),
-    }
+    point = {"type": "Point", "coordinates": [longitude, latitude]}
+    return {"type": "Feature", "id": result.index, "geometry": point, "properties": _properties(result)}
 
 
 def _properties(result: WindowResult) -> dict[str, Any]:

@@ -47,9 +47,7 @@ def write_csv(out: Any, rows: Rows) -> None:
 
 def _cell(value: Any) -> Any:
     """A text as `shown`, with an apostrophe before what a spreadsheet would compute; another value as it is."""
-    if not isinstance(value, str):
-        return value
-    return "'" * value.startswith(FORMULA) + shown(value)
+    return "'" * value.startswith(FORMULA) + shown(value) if isinstance(value, str) else value
 
 
 def parquet_of(rows: Rows, columns: Iterable[str] = ()) -> bytes:
@@ -86,10 +84,8 @@ def arrow_schema(names: Iterable[str]) -> Any:
         "text": pa.string(), "number": pa.float64(), "integer": pa.int64(), "truth": pa.bool_(),
         "time": pa.timestamp("ms", tz="UTC"),
     }  # fmt: skip
-    fields = []
-    for name in names:
-        kind, unit = _described(name)
-        fields.append(pa.field(name, types[kind], metadata={"unit": unit} if unit else None))
+    described = ((name, *_described(name)) for name in names)
+    fields = [pa.field(name, types[kind], metadata={"unit": unit} if unit else None) for name, kind, unit in described]
     return pa.schema(fields, metadata={"soilbus_version": __version__, "soilbus_schema": SCHEMA_VERSION})
 
 

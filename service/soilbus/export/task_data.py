@@ -140,22 +140,15 @@ def _root(name: str) -> ElementTree.Element:
         ManagementSoftwareManufacturer="the soilbus authors", ManagementSoftwareVersion=__version__,
         TaskControllerManufacturer="the soilbus authors", TaskControllerVersion=__version__,
     )  # fmt: skip
-    device = ElementTree.SubElement(
-        root, "DVC", A="DVC1", B="soilbus", C=__version__, D=name, F=STRUCTURE, G=LOCALISATION
-    )
-    element = ElementTree.SubElement(device, "DET", A="DET1", B="1", C="1", D="soilbus", E="0", F="0")
-    first = 2
-    for n in range(len(QUANTITIES)):
-        ElementTree.SubElement(element, "DOR", A=str(first + n))
-    shown = first + len(QUANTITIES)
+    below, first, shown = ElementTree.SubElement, 2, 2 + len(QUANTITIES)
+    device = below(root, "DVC", A="DVC1", B="soilbus", C=__version__, D=name, F=STRUCTURE, G=LOCALISATION)
+    element = below(device, "DET", A="DET1", B="1", C="1", D="soilbus", E="0", F="0")
+    for n in range(first, shown):
+        below(element, "DOR", A=str(n))
     for n, (ddi, quantity) in enumerate(QUANTITIES.items()):
-        ElementTree.SubElement(
-            device, "DPD", A=str(first + n), B=f"{ddi:04X}", C="0", D="1", E=quantity.name, F=str(shown + n)
-        )
-    for n, quantity in enumerate(QUANTITIES.values()):
-        ElementTree.SubElement(
-            device, "DVP", A=str(shown + n), B="0", C=f"{quantity.step:g}", D=str(quantity.decimals), E=quantity.unit
-        )
+        below(device, "DPD", A=str(first + n), B=f"{ddi:04X}", C="0", D="1", E=quantity.name, F=str(shown + n))
+    for n, of in enumerate(QUANTITIES.values(), shown):
+        below(device, "DVP", A=str(n), B="0", C=f"{of.step:g}", D=str(of.decimals), E=of.unit)
     return root
 
 

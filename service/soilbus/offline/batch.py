@@ -36,6 +36,8 @@ STATES_AT_ONCE = 32
 """Files that are asked for their state at once: of 80 000 logs on a server that answers in 50 ms in two minutes."""
 OF_DIAGNOSIS = ("diagnosis.json", "effects.parquet")
 """What `--diagnose` writes."""
+Say = Callable[[str], None]
+"""Says what is done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,38 +89,30 @@ def results_in(out: Path) -> Iterator[None]:
 
 
 def run_batch(
-    client: Any,
-    jobs: Sequence[Job],
-    out: Path,
-    progress: Callable[[str], None] = lambda _: None,
-    diagnose: bool = False,
-    retry: bool = False,
+    client: Any, jobs: Sequence[Job], out: Path, say: Say = lambda _: None, diagnose: bool = False, retry: bool = False
 ) -> Batch:
     """Replay all logs that are not done yet, then write the results of all into a folder.
 
     With `diagnose` each vehicle is diagnosed over its logs, and the fleet. With `retry` logs that failed or were
-    damaged are read again, and vehicles diagnosed again that lack a log. `progress` is called with what is done.
+    damaged are read again, and vehicles diagnosed again that lack a log. `say` is called with what is done.
 
     ConfigError where the configuration fits no log; BatchError where the scheduler is lost, or a part cannot be read;
     NotWritten where a file cannot be written.
     """
     parts = out / "parts"
     before = {digest: each for digest, each in _all_kept(jobs, parts).items() if not (retry and each.fault)}
-    of_logs = before | _replay_all(client, jobs, parts, before, progress)
+    of_logs = before | _replay_all(client, jobs, parts, before, say)
     if jobs and sum(each.other_bus for each in of_logs.values()) == len(jobs):
         first = next(iter(of_logs.values())).fault
         names = ", ".join(sorted({job.setup.name for job in jobs}))
         raise ConfigError([f"{names}: fits no log: none of {len(jobs)} logs has a frame that its DBC knows ({first})"])
     summaries = {job.digest: summary for job in jobs if (summary := of_logs[job.digest].summary) is not None}
     windows = {digest: summary["windows.all"] for digest, summary in summaries.items()}
-    errors = [
-        {"vehicle": job.vehicle, "log": job.log, "windows": windows.get(job.digest, 0), "fault": shown(fault)}
-        for job in jobs
-        if (fault := of_logs[job.digest].fault)
-    ]
+    failed = [(job, fault, windows.get(job.digest, 0)) for job in jobs if (fault := of_logs[job.digest].fault)]
+    errors = [{"vehicle": of.vehicle, "log": of.log, "windows": n, "fault": shown(why)} for of, why, n in failed]
     logs = dataset.log_rows(summaries.values())
     vehicles = dataset.vehicle_rows(logs, errors)
-    progress("tables")
+    say("tables")
     dataset.write_windows(out, [part_path(parts, digest) for digest in summaries])
     dataset.put(out / "errors.parquet", parquet_of(errors, dataset.ERROR_COLUMNS))
     if logs:
@@ -129,15 +123,9 @@ def run_batch(
     stale = [] if diagnose else [path for name in OF_DIAGNOSIS if (path := out / name).exists()]
     for path in stale:
         path.unlink()
-    return Batch(
-        vehicles,
-        errors,
-        sum(windows.values()),
-        len(before),
-        sum(each.fault is not None for each in before.values()),
-        _diagnose_all(client, jobs, summaries, out, progress, retry) if diagnose else None,
-        bool(stale),
-    )
+    fleet = _diagnose_all(client, jobs, summaries, out, say, retry) if diagnose else None
+    failed_before = sum(each.fault is not None for each in before.values())
+    return Batch(vehicles, errors, sum(windows.values()), len(before), failed_before, fleet, bool(stale))
 
 
 def _all_kept(jobs: Sequence[Job], parts: Path) -> dict[str, Outcome]:
@@ -172,7 +160,7 @@ def _state_of(log: str) -> tuple[int | None, int | None]:
 
 
 def _replay_all(
-    client: Any, jobs: Sequence[Job], parts: Path, before: Mapping[str, Outcome], progress: Callable[[str], None]
+    client: Any, jobs: Sequence[Job], parts: Path, before: Mapping[str, Outcome], progress: Say
 ) -> dict[str, Outcome]:
     """What comes of each log of which nothing is kept, by digest; on disk where the same log gives it again."""
     left = {job.digest: job for job in jobs if job.digest not in before}
@@ -205,12 +193,7 @@ def _failed(job: Job, error: BaseException) -> Outcome:
 
 
 def _diagnose_all(
-    client: Any,
-    jobs: Sequence[Job],
-    summaries: Mapping[str, Mapping[str, Any]],
-    out: Path,
-    progress: Callable[[str], None],
-    retry: bool,
+    client: Any, jobs: Sequence[Job], summaries: Mapping[str, Mapping[str, Any]], out: Path, progress: Say, retry: bool
 ) -> dict[str, Any]:
     """Findings of every vehicle, kept one by one, and the fleet's diagnosis of them."""
     read = [job for job in jobs if job.digest in summaries]
@@ -226,11 +209,7 @@ def _diagnose_all(
 
 
 def _diagnosed(
-    client: Any,
-    vehicles: Sequence[Sequence[Job]],
-    parts: Path,
-    progress: Callable[[str], None],
-    retry: bool,
+    client: Any, vehicles: Sequence[Sequence[Job]], parts: Path, progress: Say, retry: bool
 ) -> list[dict[str, Any]]:
     """Findings of each vehicle; those that are kept are not made again."""
 

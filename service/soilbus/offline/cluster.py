@@ -67,9 +67,8 @@ def _check_workers(client: Any, address: str) -> None:
     if not versions:
         raise BatchError(f"{address}: the scheduler has no workers")
     if others := sorted(versions - {__version__}):
-        raise BatchError(
-            f"{address}: workers have soilbus {', '.join(others)}, this is {__version__}: install the same everywhere"
-        )
+        versions_there = f"workers have soilbus {', '.join(others)}, this is {__version__}"
+        raise BatchError(f"{address}: {versions_there}: install the same everywhere")
 
 
 def done_in_turn(

@@ -54,9 +54,6 @@ class TableError(LogError):
     """Error of a table that cannot be used; one line says where and why."""
 
 
-# --- cells
-
-
 def read_columns(path: Path, needed: Sequence[str] | None) -> Columns:
     """Return the cells of the needed columns of a CSV or Parquet file; of all columns by default.
 
@@ -182,9 +179,6 @@ def number(cell: Any) -> float:
     return value if math.isfinite(value) else math.inf
 
 
-# --- signals over time
-
-
 class Samples(NamedTuple):
     """Times [s] and values (N,) of a column, their order among those of others, and the unit that the file names."""
 
@@ -253,9 +247,8 @@ def read_samples(path: Path, time: TimeColumn, names: Sequence[str] | None = Non
     if kind_of(path) == ".mf4":
         return _mf4(path, names)
     if not time.time:
-        raise TableError(
-            f"{path}: which column is the time? None is called t, time, timestamp or Zeit; columns.time says it"
-        )
+        none = "None is called t, time, timestamp or Zeit; columns.time says it"
+        raise TableError(f"{path}: which column is the time? {none}")
     cells = read_columns(path, None if names is None else list(dict.fromkeys([time.time, *names])))
     if time.time not in cells:
         raise TableError(f"{path}: no column {time.time}{did_you_mean(time.time, cells)}")
@@ -304,9 +297,8 @@ def _times(path: Path, time: TimeColumn, cells: Sequence[Any]) -> Array:
         times = np.array([math.inf if date is None else date for date in dates], np.float64)
     backwards = int((np.diff(times[np.isfinite(times)]) < 0.0).sum())
     if len(times) >= LEAST_STAMPS and backwards > MOST_BACKWARDS * len(times):
-        raise TableError(
-            f"{path}: column {time.time} goes backwards in {backwards} of {len(times)} rows: sort them by time"
-        )
+        rows = f"{backwards} of {len(times)} rows"
+        raise TableError(f"{path}: column {time.time} goes backwards in {rows}: sort them by time")
     return np.asarray(times)
 
 
@@ -320,19 +312,12 @@ def _mf4(path: Path, names: Sequence[str] | None) -> dict[str, Samples]:
         with opened(path) as stream, placed_copy(stream) as copy:
             check_mf4_blocks(copy)
             with mdf_of(copy) as file:
-                known = {
-                    name: places[0]
-                    for name, places in file.channels_db.items()
-                    if file.masters_db.get(places[0][0]) != places[0][1]
-                }
+                first = {name: places[0] for name, places in file.channels_db.items()}
+                known = {name: (group, at) for name, (group, at) in first.items() if file.masters_db.get(group) != at}
                 check_columns(path, list(known), names or ())
                 start = file.header.start_time.timestamp()
                 found = {name: file.get(name, *known[name]) for name in names or known}
-                return {
-                    name: _channel(signal, start)
-                    for name, signal in found.items()
-                    if signal.samples.dtype.kind in "buif"
-                }
+                return {name: _channel(of, start) for name, of in found.items() if of.samples.dtype.kind in "buif"}
     except OSError as error:
         raise TableError(f"{path}: {error.strerror or one_line(error, 100)}") from None
     except LogError:

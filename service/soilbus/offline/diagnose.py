@@ -84,9 +84,7 @@ def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], Non
     """
     report = say or (lambda _: None)
     if config.table is None:
-        recordings = recordings_of(
-            config, load_databases(config), logs, lambda frames, _: report(f"reading, {frames} frames") if say else None
-        )
+        recordings = recordings_of(config, load_databases(config), logs, lambda n, _: report(f"reading, {n} frames"))
         catalogue = possible_effects(config)
     else:
         recordings = recordings_of_tables(config, logs)

@@ -59,11 +59,8 @@ def findings_of(jobs: Sequence[Job]) -> dict[str, Any]:
     except (NotFitted, np.linalg.LinAlgError) as error:
         return record | {"fault": one_line(error, 200)}
     diagnosis = found.diagnosis
-    record |= {
-        "fault": None,
-        "verdict": str(diagnosis.verdict),
-        "gap": {"before": diagnosis.gap_before.value, "after": diagnosis.gap_after.value},
-    }
+    gap = {"before": diagnosis.gap_before.value, "after": diagnosis.gap_after.value}
+    record |= {"fault": None, "verdict": str(diagnosis.verdict), "gap": gap}
     values = diagnosis.completed.parameters()
     scope = {effect.name: "log" if effect.of_record else "vehicle" for effect in catalogue}
     record["effects"] = [
@@ -111,19 +108,12 @@ def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
         for effect in each["effects"]:
             expected[effect["name"]] += effect["probability"]
             names[effect["name"]] += effect["named"]
-    return {
-        "false_discovery_rate": FALSE_DISCOVERY_RATE,
-        "vehicles_diagnosed": diagnosed,
-        "effects": [
-            {
-                "name": name,
-                "vehicles_named": names[name],
-                "expected_share": expected[name] / diagnosed,
-            }
-            for name in sorted(expected)
-        ],
-        "vehicles": list(findings),
-    }
+    shares = [
+        {"name": name, "vehicles_named": names[name], "expected_share": expected[name] / diagnosed}
+        for name in sorted(expected)
+    ]
+    head = {"false_discovery_rate": FALSE_DISCOVERY_RATE, "vehicles_diagnosed": diagnosed}
+    return {**head, "effects": shares, "vehicles": list(findings)}
 
 
 def effect_rows(fleet: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -143,10 +143,8 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
 
     def chance(found: Sequence[Sequence[float]], times: int = 1) -> float:
         """Expected probability of the right name after this number of drives."""
-        after = [
-            expected_probability(least, name, {n: times * s for n, s in zip(names, row, strict=True)})
-            for name, row in zip(names, found, strict=True)
-        ]
+        rows = [{n: times * s for n, s in zip(names, row, strict=True)} for row in found]
+        after = [expected_probability(least, name, row) for name, row in zip(names, rows, strict=True)]
         return float(weight @ after / weight.sum()) if after else 0.0
 
     def score(manoeuvre: Manoeuvre) -> float:
@@ -158,10 +156,8 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
         return None
     found = _separations(diagnosis, config, best, true)
     enough = (times for times in range(1, MAX_REPEATS + 1) if chance(found, times) >= DEFAULT.named_probability)
-    separations = {
-        name: {other: s for other, s in zip(names, row, strict=True) if other != name}
-        for name, row in zip(names, found, strict=True)
-    }
+    rows = {name: zip(names, row, strict=True) for name, row in zip(names, found, strict=True)}
+    separations = {name: {other: s for other, s in row if other != name} for name, row in rows.items()}
     return Plan(best, names, separations, chance(found), next(enough, None))
 
 

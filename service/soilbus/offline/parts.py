@@ -250,13 +250,8 @@ def _summary(table: Any, job: Job, config: Config, pipeline: Pipeline | None, fa
     else:
         heard, refusals = pipeline.admission.counts, pipeline.intake.refusals
         rejected = {f"rejected.{reason}": n for reason, n in refusals.total.items()}
-        frames = {
-            "frames.mapped": sum(heard.received.values()),
-            "frames.unknown": heard.unknown,
-            "frames.error": heard.error_frames,
-            "frames.lost": pipeline.admission.missed,
-            "frames.other_channel": heard.elsewhere,
-        }
+        frames = {"mapped": sum(heard.received.values()), "unknown": heard.unknown, "error": heard.error_frames}
+        frames |= {"lost": pipeline.admission.missed, "other_channel": heard.elsewhere}
     return {
         "vehicle": job.vehicle,
         "log": job.log,
@@ -267,7 +262,7 @@ def _summary(table: Any, job: Job, config: Config, pipeline: Pipeline | None, fa
         "windows.all": table.num_rows,
         **{f"windows.{each}": counts[each] for each in (*Status, *State)},
         "bearing_pressure.mean": sum(pressures) / len(pressures) if pressures else None,
-        **frames,
+        **{f"frames.{which}": n for which, n in frames.items()},
         "samples": None if pipeline is None else refusals.used,
         **dict(sorted(rejected.items())),
         "fault": fault,

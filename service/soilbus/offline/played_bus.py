@@ -122,7 +122,6 @@ class PlayedBus:
     def _is_heard(self, identifier: int, extended: bool) -> bool:
         key = identifier, bool(extended)
         if key not in self._passes:
-            self._passes[key] = any(
-                f["extended"] == key[1] and (identifier ^ f["can_id"]) & f["can_mask"] == 0 for f in self._filters
-            )
+            alike = (f for f in self._filters if f["extended"] == key[1])
+            self._passes[key] = any((identifier ^ f["can_id"]) & f["can_mask"] == 0 for f in alike)
         return self._passes[key]

@@ -118,8 +118,7 @@ def parts(
 
     def end() -> None:
         intake.ingest()
-        window = intake.taken_whole()
-        if window is not None:
+        if (window := intake.taken_whole()) is not None:
             whole.append(window)
 
     intake.admission.at_break = end

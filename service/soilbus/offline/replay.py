@@ -179,7 +179,7 @@ def estimator_beside(config: Config) -> Iterator[Executor | None]:
         yield None
         return
     with workers(1, "fork", _begin, config) as beside:
-        beside.submit(_begun).result()  # forked now, before there are threads
+        beside.submit(os.getpid).result()  # forked now, before there are threads
         usual = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL)  # the pool's thread must get its turn to hand on tasks
         try:
@@ -194,10 +194,6 @@ _estimator: WindowEstimator | None = None
 def _begin(config: Config) -> None:
     global _estimator
     _estimator = WindowEstimator(config)
-
-
-def _begun() -> bool:
-    return _estimator is not None
 
 
 def _estimate(task: WindowTask) -> Undecided:

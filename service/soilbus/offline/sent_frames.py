@@ -3,8 +3,7 @@
     log -> PlayedBus -> Service (daemon) -> frames stamped with the recording's time
 
 Loop, schedule, counters and checksums are the daemon's. Solving a window takes no time of the recording; a real service
-sends the frames of a hop later by that time. Frames of soilbus itself in the
-recording are left out.
+sends the frames of a hop later by that time. Frames of soilbus itself in the recording are left out.
 """
 
 from __future__ import annotations

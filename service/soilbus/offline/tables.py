@@ -116,18 +116,12 @@ def replay_runs(config: Config, runs: Iterable[Run]) -> Iterator[WindowResult]:
 
 
 def _task(index: int, run: Run, rig: Rig) -> WindowTask:
-    window = run.window
+    window, t = run.window, run.window.t
     slip = slip_ratio(rig.radius, window.speed, window.ground_speed[:, None])
     return WindowTask(
-        index=index,
-        start=float(window.t[0]),
-        end=float(window.t[-1]),
-        window=window,
-        slip=dict(zip(rig.wheels, column_means(slip), strict=True)),
-        torque_limit=np.full(len(rig.wheels), math.nan),
-        rejected=run.rejected,
-        fresh=True,
-    )
+        index=index, start=float(t[0]), end=float(t[-1]), window=window, rejected=run.rejected, fresh=True,
+        slip=dict(zip(rig.wheels, column_means(slip), strict=True)), torque_limit=np.full(len(rig.wheels), math.nan),
+    )  # fmt: skip
 
 
 def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:

@@ -39,21 +39,17 @@ def batch_text(batch: Batch, out: Path) -> str:
 
 def fleet_text(fleet: Mapping[str, Any]) -> str:
     """Return which vehicles have which fault, and since when, in words."""
-    lines = [
-        f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
-        f"at most {fleet['false_discovery_rate']:.0%} are expected to be false"
-    ]
+    done = f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed"
+    lines = [f"{done}; of the names given, at most {fleet['false_discovery_rate']:.0%} are expected to be false"]
     for vehicle in fleet["vehicles"]:
         for effect in vehicle["effects"]:
             if effect["named"]:
                 since, onset = "", effect["onset"]
                 if onset and onset["log"] != vehicle["logs"][0]:
                     since = f", since {onset['log']} (probability {onset['probability']:.2f})"
-                sizes = ", ".join(
-                    f"{name} {value_text(each['value'], each['std'], AT_EDGE, '±')}"
-                    for name, each in effect["parameters"].items()
-                )
-                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({sizes}){since}")
+                found = effect["parameters"].items()
+                sizes = (f"{name} {value_text(of['value'], of['std'], AT_EDGE, '±')}" for name, of in found)
+                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({', '.join(sizes)}){since}")
         if vehicle["fault"]:
             lines.append(f"  {vehicle['vehicle']}: not diagnosed: {vehicle['fault']}")
     return text_of(lines)

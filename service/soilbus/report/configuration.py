@@ -63,10 +63,8 @@ def configuration_warnings(config: Config) -> list[str]:
     lines = []
     quantities = [q for q in _measured(config) if q not in config.noise.model_fields_set]
     if "noise" not in config.model_fields_set:
-        lines.append(
-            "no [noise]: that of a well-instrumented tractor is assumed, and the error bars with it; give it from data"
-            " sheets or a drive on the road"
-        )
+        assumed = "no [noise]: that of a well-instrumented tractor is assumed, and the error bars with it"
+        lines.append(f"{assumed}; give it from data sheets or a drive on the road")
     elif quantities:
         lines.append(f"[noise] does not give {', '.join(quantities)}: the defaults below are assumed")
     if config.table is None:
@@ -77,10 +75,9 @@ def configuration_warnings(config: Config) -> list[str]:
                 names, alone = " and ".join(wheel.name for wheel in wheels), ""
                 if role == "load":
                     alone = "; if it is the cell of one wheel, map it for that one alone: other loads are then computed"
-                lines.append(
-                    f"{getattr(wheels[0], role).signal} is the {role} of {names}: one measurement of their mean, with"
-                    f" one noise; what differs between them stays open{alone}"
-                )
+                of = f"{getattr(wheels[0], role).signal} is the {role} of {names}"
+                mean = "one measurement of their mean, with one noise"
+                lines.append(f"{of}: {mean}; what differs between them stays open{alone}")
     c = config.soil.c
     if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
         lines.append(f"soil.c.value = {c.value:g} Pa is next to nothing; is it in kPa?")
@@ -93,10 +90,8 @@ def no_slope(config: Config) -> str:
     is_felt = config.signals.pitch is not None or (felt is not None and felt.kind == "specific_force")
     if config.vehicle is None or config.table is not None or is_felt:
         return ""
-    return (
-        'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: the ground counts as level,'
-        " and each per cent of slope as a draft of one per cent of the weight"
-    )
+    level = "the ground counts as level, and each per cent of slope as a draft of one per cent of the weight"
+    return f'neither signals.pitch nor an acceleration of kind "specific_force" is mapped: {level}'
 
 
 def _lines_of_vehicle(config: Config) -> Iterator[str]:
@@ -109,28 +104,20 @@ def _lines_of_vehicle(config: Config) -> Iterator[str]:
     if vehicle is None:
         return
     if vehicle.towing == "measured" and signals.draft is None:
-        yield (
-            'signals.draft is not mapped, and vehicle.towing is not "never": the draft is unknown, so there is no GO,'
-            " only what could be pulled"
-        )
+        what = "the draft is unknown, so there is no GO, only what could be pulled"
+        yield f'signals.draft is not mapped, and vehicle.towing is not "never": {what}'
     if vehicle.towing == "unknown" and signals.draft is not None:
-        yield (
-            'vehicle.towing = "unknown": signals.draft is not used, so there is no GO; if it shows all that is towed,'
-            ' "measured" is meant'
-        )
+        what = 'if it shows all that is towed, "measured" is meant'
+        yield f'vehicle.towing = "unknown": signals.draft is not used, so there is no GO; {what}'
     if line := no_slope(config):
         yield line
     if vehicle.steering == "skid" and not (vehicle.track or signals.yaw_rate):
-        yield (
-            'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: how far the wheels slide'
-            " sideways in a turn is not known"
-        )
+        what = "how far the wheels slide sideways in a turn is not known"
+        yield f'vehicle.steering = "skid" with neither vehicle.track nor signals.yaw_rate: {what}'
     for wheel in config.wheel:
         if wheel.gear_ratio != 1.0 and not any(getattr(wheel, role) for role in WHEEL_ROLES):
-            yield (
-                f"{wheel.section}.{wheel.name}.gear_ratio = {wheel.gear_ratio:g} concerns no signal of it; that of the"
-                f" axle's motor is axle.{wheel.axle}.gear_ratio"
-            )
+            own = f"{wheel.section}.{wheel.name}.gear_ratio = {wheel.gear_ratio:g}"
+            yield f"{own} concerns no signal of it; that of the axle's motor is axle.{wheel.axle}.gear_ratio"
 
 
 MAX_SOILS_NAMED = 3
@@ -216,27 +203,23 @@ def load_lines(config: Config) -> Iterator[str]:
         yield f"{' and '.join(wheels)} are weighed together: what each carries follows from roll and their torques."
     computed = [rig.wheels[i] for i in np.flatnonzero(given.computes("load"))]
     if without := [wheel for wheel in computed if not any(wheel in wheels for wheels in together)]:
-        yield (
-            f"No load cell at {', '.join(without)}: the load follows from mass, centre of gravity, pitch, acceleration"
-            " and draft, and in a single instant is hardly known (noise.computed_load)."
-        )
+        of = "the load follows from mass, centre of gravity, pitch, acceleration and draft"
+        instant = "in a single instant is hardly known (noise.computed_load)"
+        yield f"No load cell at {', '.join(without)}: {of}, and {instant}."
     cells = [wheel.model_copy(update={"load": wheel.load or Signal(signal="A.Cell")}) for wheel in config.wheel]
     own, with_cells = _expected(config), _expected(config.model_copy(update={"wheel": cells}))
     if own is None or with_cells is None:
         return
     limit, load = config.estimator.max_bearing_std, "slope" if rig.towing == "never" else "draft"
-    yield (
-        f"After {config.estimator.window:g} s of varied {load} on the soil assumed below, bearing pressure is known to"
-        f" {own[0]:.1%} (with load cells to {with_cells[0]:.1%}), tan phi to {own[1]:.1%} ({with_cells[1]:.1%}), as far"
-        " as the sensors go; what the form of the contact leaves open comes on top."
-    )
+    after = f"After {config.estimator.window:g} s of varied {load} on the soil assumed below"
+    pressure = f"bearing pressure is known to {own[0]:.1%} (with load cells to {with_cells[0]:.1%})"
+    friction = f"tan phi to {own[1]:.1%} ({with_cells[1]:.1%}), as far as the sensors go"
+    yield f"{after}, {pressure}, {friction}; what the form of the contact leaves open comes on top."
     if own[0] > limit:
         is_usual = own[0] <= BEARING_STD_WITHOUT_CELLS
         way_out = f"set it to {BEARING_STD_WITHOUT_CELLS:g}" if is_usual else "narrow the soil's prior in [soil]"
-        yield (
-            f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std) count as not excited, and"
-            f" there is no GO; without load cells {way_out}."
-        )
+        windows = f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std)"
+        yield f"{windows} count as not excited, and there is no GO; without load cells {way_out}."
 
 
 def _expected(config: Config) -> tuple[float, float] | None:
@@ -323,9 +306,8 @@ def identifiable(config: Config) -> dict[str, str]:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
         is_sure = len(forces) == 2
-        strength = (
-            f"{'yes' if is_sure else 'weakly'}: {', '.join(forces)}" if forces else "no: needs torque or drawbar pull"
-        )
+        known = f"{'yes' if is_sure else 'weakly'}: {', '.join(forces)}"
+        strength = known if forces else "no: needs torque or drawbar pull"
         depth = f"{'yes' if is_sure or sinkage else 'weakly'}: {', '.join([*forces, *['sinkage'] * sinkage])}"
         verdicts = {
             "k_c": "weakly: two tyre widths" if widths else "no: needs two tyre widths (prior kept)",
@@ -356,8 +338,6 @@ def prior_text(config: Config) -> str:
         named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MAX_SOILS_NAMED])
         more = f" and {len(outside) - MAX_SOILS_NAMED} more" if len(outside) > MAX_SOILS_NAMED else ""
         rows.append((name, *(f"{x / size:.3g}" for x in (median, low, high)), unit, named + more or "none"))
-    return (
-        table(("parameter", "assumed", "95 % from", "to", "unit", "known soils outside"), rows)
-        + "\nOn a soil outside, a badly determined parameter stays near the prior, with a deviation too small; set"
-        "\n[soil] there.  Bearing pressure, drafts and slopes depend on what the sensors determine well."
-    )
+    text = table(("parameter", "assumed", "95 % from", "to", "unit", "known soils outside"), rows)
+    text += "\nOn a soil outside, a badly determined parameter stays near the prior, with a deviation too small; set"
+    return f"{text}\n[soil] there.  Bearing pressure, drafts and slopes depend on what the sensors determine well."

@@ -284,8 +284,8 @@ class Dashboard:
     def wheels(self) -> list[int]:
         """Return the numbers of the wheels to show: those of the configuration, else four and those with a value."""
         named = len(self.vehicle.wheels) or 4
-        has_value = (self.wheel_slip(i) is not None or self.wheel_sinkage(i) is not None for i in range(WHEELS))
-        return [i for i, is_known in enumerate(has_value) if i < named or is_known]
+        values = {i: (self.wheel_slip(i), self.wheel_sinkage(i)) for i in range(WHEELS)}
+        return [i for i, of in values.items() if i < named or of != (None, None)]
 
     def max_draft(self) -> float | None:
         """Return the largest draft [N] here and now, while it may be acted on; 0 where it is stuck without any."""

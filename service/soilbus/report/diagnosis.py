@@ -77,11 +77,10 @@ def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterat
     if diagnosis.verdict is Verdict.UNKNOWN:
         yield Step("Check mass, radii, gear ratios, signs and mounting of the channels that disagree most.")
     if diagnosis.verdict is Verdict.NONE:
-        yield Step(
-            "Compare the noise that the configuration states with that of the sensors; measure wheel loads."
-            if diagnosis.gap_after.exceeds_noise()
-            else "Nothing is to be added. Smaller effects show in longer recordings that vary the load more."
-        )
+        what = "Nothing is to be added. Smaller effects show in longer recordings that vary the load more."
+        if diagnosis.gap_after.exceeds_noise():
+            what = "Compare the noise that the configuration states with that of the sensors; measure wheel loads."
+        yield Step(what)
     for sentence, lines in to_tell_apart(diagnosis):
         yield Step(sentence, lines=lines)
     if findings.plan is not None:

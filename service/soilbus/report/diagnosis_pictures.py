@@ -152,10 +152,8 @@ def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
         found = grouped(model.held_out_series(), lambda series: series.channel)
         errors = {channel: np.concatenate([part.standardised for part in of]) for channel, of in found.items()}
         bars[when] = {channel: float(np.mean(error**2)) ** 0.5 for channel, error in errors.items()}
-    words = "; ".join(
-        " ".join([when, *(f"{channel} {size:.2f}" for channel, size in of.items())]).strip()
-        for when, of in bars.items()
-    )
+    sizes_of = {when: [f"{channel} {size:.2f}" for channel, size in of.items()] for when, of in bars.items()}
+    words = "; ".join(" ".join([when, *said]) for when, said in sizes_of.items())
     height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
 
     def draw(figure: Any) -> None:
@@ -181,9 +179,8 @@ def _bars(
         colour, hatch = LOOKS[when] if len(bars) > 1 else LOOKS["after"]
         y = np.arange(len(sizes)) + (i - (len(bars) - 1) / 2.0) * height
         error = {} if sd is None else {"xerr": 2.0 * np.array(sd[when]), "capsize": 3}
-        bar = axis.barh(
-            y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error
-        )
+        look = {"color": colour, "hatch": hatch, "edgecolor": "0.3", "lw": 0.4}
+        bar = axis.barh(y, sizes, 0.92 * height, label=when, **look, **error)
         axis.bar_label(bar, labels[when], padding=5, fontsize=10)
         drawn += [bar] if len(bars) > 1 else []
     axis.invert_yaxis()
@@ -204,25 +201,19 @@ def draft_picture(findings: Findings) -> Picture | None:
     parts = [findings.diagnosis.base.checks[i].problem for i in findings.recordings.first]
     measured = findings.config.signals.draft is not None
     pulled = [part.draft[part.has_balance] / 1e3 if measured else part.draft[:0] for part in parts]
-    words = "; ".join(
-        " ".join([name, *(f"{when} {_kilonewtons(of[i])}" for when, of in bars.items())])
-        for i, name in enumerate(names)
-    )
+    labels = {when: [_kilonewtons(e) for e in of] for when, of in bars.items()}
+    said = (" ".join([name, *(f"{when} {of[i]}" for when, of in labels.items())]) for i, name in enumerate(names))
+    words = "; ".join(said)
 
     def draw(figure: Any) -> None:
-        axis = figure.subplots()
-        none = Estimate(0.0, 0.0)
-        sizes, sds = (
-            {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()}
-            for part in ("value", "std")
-        )
-        labels = {when: [_kilonewtons(e) for e in of] for when, of in bars.items()}
+        axis, none = figure.subplots(), Estimate(0.0, 0.0)
+        sizes = {when: [(e or none).value / 1e3 for e in of] for when, of in bars.items()}
+        sds = {when: [(e or none).std / 1e3 for e in of] for when, of in bars.items()}
         handles = _bars(axis, sizes, 0.55 / len(bars), labels, sds)
-        known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
-        lines = [
-            axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")[0]
-            for i, low, high in known
-        ]
+        look, lines = {"color": "black", "lw": 3.0, "label": "pulled, 95 % of the time"}, []
+        for i, draft in enumerate(pulled):
+            if len(draft):
+                lines += axis.plot(np.percentile(draft, (2.5, 97.5)), [i + 0.38] * 2, "-", **look)
         axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
         axis.set_xlabel("draft, kN")
         if handles := [*handles, *lines[:1]]:

@@ -26,12 +26,9 @@ def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     verdict = dashboard.verdict()
     lines = band(verdict, width, height // 3)
     lines.append(Text(verdict.todo.center(width).rstrip(), style="bold"))
-    is_roomy = height > LEAST_HEIGHT + 4
-    lines += [Text()] if is_roomy else []
-    lines += _slip(dashboard, width, max(height // 16, 1))
-    lines += [Text()] if is_roomy else []
-    lines += _draft(dashboard, width, height - len(lines) - 1)
-    return [*lines, footer(dashboard, width)]
+    space = [Text()] * (height > LEAST_HEIGHT + 4)
+    lines += [*space, *_slip(dashboard, width, max(height // 16, 1)), *space]
+    return [*lines, *_draft(dashboard, width, height - len(lines) - 1), footer(dashboard, width)]
 
 
 def small_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
@@ -87,8 +84,6 @@ def _draft(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     scale = [f"{force(top, top) if top else '':>{AXIS - 2}} ┤", *[f"{'│':>{AXIS}}"] * (rows - 2), f"{'0 ┤':>{AXIS}}"]
     axis = f"{'':{AXIS}}{f'{dashboard.span:.0f} s ago':<{columns - 3}}now"
     legend = "█ draft  ─ possible"
-    return [
-        Text(f"{'DRAFT  ' + '  of possible '.join(dashboard.drafts()):<{width - len(legend)}}{legend}", style="bold"),
-        *(Text(left + right) for left, right in zip(scale, chart, strict=True)),
-        Text(axis),
-    ]
+    title = f"{'DRAFT  ' + '  of possible '.join(dashboard.drafts()):<{width - len(legend)}}{legend}"
+    body = [Text(left + right) for left, right in zip(scale, chart, strict=True)]
+    return [Text(title, style="bold"), *body, Text(axis)]

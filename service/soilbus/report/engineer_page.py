@@ -49,11 +49,9 @@ def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
     state = f" {verdict.said}"
     state = f"{state:<{max(width - len(soil) - 1, len(state) + 2)}}{soil} "[:width].ljust(width)
     head = [Text(state, style=verdict.style), fitted(Text(_forecast(known)), width)]
-    blocks = [block(dashboard) for block in BLOCKS]
-    columns = max(width // (COLUMN + GAP), 1)
-    room = height - len(head) - 1
+    blocks, columns = [block(dashboard) for block in BLOCKS], max(width // (COLUMN + GAP), 1)
     body = [Text(), *packed(blocks, columns, width, 1), Text()]
-    if len(body) + LEAST_CHARTS > room:
+    if len(body) + LEAST_CHARTS > height - len(head) - 1:
         body = packed(blocks, columns, width, 0)
     lines = [*head, *body][: height - 1]
     each = (width - GAP) // 2
@@ -156,10 +154,8 @@ def _advice(dashboard: Dashboard) -> list[Text]:
         share = dashboard.known.number("TractionAdvice", signal)
         return _cell(dashboard.known, "TractionAdvice", None if share is None else 100.0 * share, "{:.0f}")
 
-    rows: list[Row] = [
-        (name, cell(f"SlipFor{kind}Front"), cell(f"SlipFor{kind}Rear"))
-        for name, kind in (("efficiency", "Efficiency"), ("most pull", "Pull"))
-    ]
+    kinds = {"efficiency": "Efficiency", "most pull": "Pull"}
+    rows = ((name, cell(f"SlipFor{kind}Front"), cell(f"SlipFor{kind}Rear")) for name, kind in kinds.items())
     return grid(("best slip, %, for", "front", "rear"), *rows)
 
 

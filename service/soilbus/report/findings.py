@@ -52,7 +52,9 @@ def findings_json(findings: Findings) -> str:
 
 def findings_record(findings: Findings) -> dict[str, Any]:
     """The same as nested dicts and lists, None for numbers that are not finite."""
-    diagnosis, recordings = findings.diagnosis, findings.recordings
+    diagnosis, recordings, after = findings.diagnosis, findings.recordings, findings.diagnosis.gap_after
+    models = {"before": diagnosis.base, "after": diagnosis.completed}
+    gap = {"before": diagnosis.gap_before.value, "after": after.value, "noise_floor": 1.0, "limit": after.limit()}
     soils = [
         {"log": name, "before": _soil(b, findings), "after": _soil(a, findings)} for name, b, a in findings.soils()
     ]
@@ -62,18 +64,8 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "doubt": doubt(diagnosis),
         "where": [{name: getattr(place, name) for name in PLACE} for place in diagnosis.where],
         "effects": [_effect(addition, diagnosis.completed) for addition in diagnosis.additions],
-        "gap": {
-            "before": diagnosis.gap_before.value,
-            "after": diagnosis.gap_after.value,
-            "noise_floor": 1.0,
-            "limit": diagnosis.gap_after.limit(),
-            "residuals": diagnosis.gap_after.rows,
-            "open": diagnosis.gap_after.exceeds_noise(),
-        },
-        "solver": {
-            "before": [str(fit.termination) for fit in diagnosis.base.fits],
-            "after": [str(fit.termination) for fit in diagnosis.completed.fits],
-        },
+        "gap": {**gap, "residuals": after.rows, "open": after.exceeds_noise()},
+        "solver": {when: [str(fit.termination) for fit in model.fits] for when, model in models.items()},
         **_shown(findings),
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],
@@ -94,8 +86,7 @@ def findings_record(findings: Findings) -> dict[str, Any]:
         "too_short": list(recordings.too_short),
         "seconds": round(findings.seconds, 3),
     }
-    record: dict[str, Any] = known(document)
-    return record
+    return dict(known(document))
 
 
 def _shown(findings: Findings) -> dict[str, Any]:
@@ -141,10 +132,8 @@ def why_ambiguous(addition: Addition) -> str | None:
         return None
     best = addition.falls[addition.effect.name]
     others = ", ".join(f"{name} by {addition.falls[name]:.0f}" for name in addition.alternatives)
-    return (
-        f"{addition.effect.name} lowers -2 log evidence by {best:.0f}, {others}: "
-        "in this recording they change torque, draft and sinkage alike"
-    )
+    lowers = f"{addition.effect.name} lowers -2 log evidence by {best:.0f}, {others}"
+    return f"{lowers}: in this recording they change torque, draft and sinkage alike"
 
 
 def _soil(posterior: Posterior, findings: Findings) -> dict[str, Any]:
@@ -159,10 +148,8 @@ def findings_text(findings: Findings) -> str:
     diagnosis = findings.diagnosis
     before, after = diagnosis.gap_before, diagnosis.gap_after
     lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), ""]
-    lines.append(
-        f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
-        f"noise alone: 1, hardly ever above {after.limit():.2f})"
-    )
+    gap = f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals"
+    lines.append(f"{gap}; noise alone: 1, hardly ever above {after.limit():.2f})")
     lines += [f"  {line}" for line in place_lines(findings)]
     lines += [*configured_lines(diagnosis), *shown_lines(diagnosis, findings.config)]
     for number, addition in enumerate(diagnosis.additions, 1):
@@ -171,11 +158,9 @@ def findings_text(findings: Findings) -> str:
         lines += ["", *plan_lines(findings.plan)]
     if diagnosis.residual_terms:
         lines += ["", "what is left, described:"]
-        lines += [
-            f"  {_channel(terms)}: reading less model = {terms.formula} [{UNITS[terms.channel]}] "
-            f"({100 * terms.explained:.0f} % of the held-out excess)"
-            for terms in diagnosis.residual_terms
-        ]
+        for terms in diagnosis.residual_terms:
+            formula = f"{_channel(terms)}: reading less model = {terms.formula} [{UNITS[terms.channel]}]"
+            lines.append(f"  {formula} ({100 * terms.explained:.0f} % of the held-out excess)")
         lines.append(f"  {WARNING}")
     recordings = findings.recordings
     refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
@@ -243,12 +228,11 @@ def configured_lines(diagnosis: Diagnosis) -> Iterator[str]:
     fitted = diagnosis.completed.parameters()
     for effect in diagnosis.base.effects:
         priors = diagnosis.base.prior_parameters()[effect.name]
-        found = [
-            f"{name} {value_text(prior.value, prior.std)}{unit}, fitted {value_text(one.value, one.std, AT_EDGE)}{unit}"
-            for name, prior in priors.items()
-            if prior.std > 0.0
-            for one, unit in [(fitted[effect.name][name], _unit_of(name, effect))]
-        ]
+        found = []
+        for name in [name for name, prior in priors.items() if prior.std > 0.0]:
+            prior, one, unit = priors[name], fitted[effect.name][name], _unit_of(name, effect)
+            given = f"{name} {value_text(prior.value, prior.std)}{unit}"
+            found.append(f"{given}, fitted {value_text(one.value, one.std, AT_EDGE)}{unit}")
         if found:
             yield f"in the configuration, {effect.name}: {'; '.join(found)}"
 
@@ -292,8 +276,7 @@ def excitation_lines(manoeuvre: Manoeuvre, expected: Posterior, now: Posterior, 
         pressure = posterior.bearing_pressure(z_ref, b_ref)
         shares.append((100.0 * pressure.std / pressure.value, math.degrees(posterior.parameters()["phi"].std)))
     (pressure_now, phi_now), (pressure_then, phi_then) = shares
-    return [
-        f"what to drive next ({manoeuvre.duration:.0f} s; --manoeuvre-out keeps it): {manoeuvre.words}",
-        f"  bearing pressure is known to +- {pressure_now:.2g} % and phi to +- {phi_now:.2g} deg; the sensors alone "
-        f"would then allow {pressure_then:.2g} % and {phi_then:.2g} deg",
-    ]
+    now_known = f"bearing pressure is known to +- {pressure_now:.2g} % and phi to +- {phi_now:.2g} deg"
+    then = f"the sensors alone would then allow {pressure_then:.2g} % and {phi_then:.2g} deg"
+    head = f"what to drive next ({manoeuvre.duration:.0f} s; --manoeuvre-out keeps it): {manoeuvre.words}"
+    return [head, f"  {now_known}; {then}"]

@@ -96,9 +96,8 @@ class Source:
     def command(self, name: str, file: Path | str | None = None) -> str:
         """Return a command over the same logs, with another configuration or the same."""
         overrides = [] if file else [word for override in self.overrides for word in ("--set", override)]
-        return shlex.join(
-            ["soilbus", name, "--config", str(file or self.file or "FILE"), *overrides, *map(str, self.logs)]
-        )
+        config = str(file or self.file or "FILE")
+        return shlex.join(["soilbus", name, "--config", config, *overrides, *map(str, self.logs)])
 
     def _configuration(self) -> str:
         if self.file is None:

@@ -13,10 +13,7 @@ from soilbus.words import shown
 def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
     """Give a function to call with frames read and time [s] since the begin; None in a pipe."""
     with phases(title) as say:
-        if say is None:
-            yield None
-            return
-        yield lambda frames, t: say(f"{frames} frames, {t:.0f} s of recording")
+        yield say and (lambda frames, t: say(f"{frames} frames, {t:.0f} s of recording"))
 
 
 @contextmanager

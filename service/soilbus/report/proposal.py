@@ -276,8 +276,7 @@ def _put_wheel(draft: _Draft, wheel: str, axle: str, driven: set[str]) -> None:
 
 
 def _put_gear(draft: _Draft, place: str) -> None:
-    ratio = draft.facts.gear_ratio.get(place)
-    if ratio is not None:
+    if (ratio := draft.facts.gear_ratio.get(place)) is not None:
         short = float(f"{ratio:.3g}")
         rounded = short if abs(short / ratio - 1.0) < ROUNDING else float(f"{ratio:.4g}")
         draft.put("gear_ratio", rounded, "motor over wheel speed in the log")
@@ -290,8 +289,7 @@ def _put_gear(draft: _Draft, place: str) -> None:
 
 
 def _put_limit(draft: _Draft, torque: Candidate, at: str) -> None:
-    limit = _beside(draft, torque, draft.matched("torque_limit", torque.slot.place))
-    if limit is not None:
+    if limit := _beside(draft, torque, draft.matched("torque_limit", torque.slot.place)):
         draft.put_signal("torque_limit", limit)
     else:
         draft.note(f"max_torque = 5000.0  # N m at the {at}: the motor's limit")
@@ -329,24 +327,17 @@ def _put_rest(draft: _Draft) -> None:
     wheels = [wheel for pair in draft.axles.values() for wheel in pair]
     if not any(all(draft.matched("load", place) for place in places) for places in (wheels, draft.axles)):
         draft.section("estimator")
-        draft.put(
-            "max_bearing_std",
-            BEARING_STD_WITHOUT_CELLS,
-            "a window without load cells knows the bearing pressure to 10 to 20 %",
-        )
-    draft.note(
-        "[noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold", apart=True
-    )
+        why = "a window without load cells knows the bearing pressure to 10 to 20 %"
+        draft.put("max_bearing_std", BEARING_STD_WITHOUT_CELLS, why)
+    noise = "[noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold"
+    draft.note(noise, apart=True)
     known = draft.assignment
     found = [*(c for cs in known.open.values() for c in cs), *known.asserted.values(), *known.rivals]
     rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
     if perhaps := grouped((c for c in rest.values() if not c.absent), lambda c: c.slot.role):
         draft.note("Not used, but perhaps:", *(f"  {role}: {_listed(cs)}" for role, cs in perhaps.items()), apart=True)
-    unnamed: dict[str, list[Candidate]] = {}
-    for c in known.unnamed:
-        if c.path not in draft.used | draft.named and not c.absent:
-            unnamed.setdefault(c.dimension, []).append(c)
-    if unnamed:
+    loose = [c for c in known.unnamed if c.path not in draft.used | draft.named and not c.absent]
+    if unnamed := grouped(loose, lambda c: c.dimension):
         lines = (f"  {dimension}: {_listed(cs)}" for dimension, cs in unnamed.items())
         draft.note("Of no role that a name says; by their units:", *lines, apart=True)
     if absent := sorted(path for path, c in rest.items() if c.absent):

@@ -93,10 +93,8 @@ class ReceivedFrames:
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
         self._messages = {(m.frame_id, m.is_extended_frame): m for m in database.messages}
         self._signals = {m.name: {s.name: s for s in m.signals} for m in database.messages}
-        self._streams = {
-            m.name: _Stream((m.cycle_time or 1000) / 1000.0, 1 << self._signals[m.name][COUNTER].length)
-            for m in database.messages
-        }
+        modulus = {name: 1 << signals[COUNTER].length for name, signals in self._signals.items()}
+        self._streams = {m.name: _Stream((m.cycle_time or 1000) / 1000.0, modulus[m.name]) for m in database.messages}
         self._clock = clock
         self.bad_frames = 0
 
@@ -150,9 +148,7 @@ class ReceivedFrames:
         if isinstance(value, NamedSignalValue):
             name = str(value)
             return None if name in ("not_available", "error") else name
-        if value is None or _is_reserved(self._signals[message][signal], value):
-            return None
-        return float(value)
+        return None if value is None or _is_reserved(self._signals[message][signal], value) else float(value)
 
     @property
     def is_unproven(self) -> bool:

@@ -24,7 +24,11 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         values = number(message, name), number(message, std or f"{name}Std")
         return {key: _times(x, unit) for key, x in zip(("value", "std"), values, strict=True)}
 
+    def set_point(of: str) -> dict[str, float | None]:
+        return {"value": number("TractionAdvice", f"SlipFor{of}"), "std": None}
+
     verdict, kind = value("Traversability", "State"), value("SoilClass", "Kind")
+    likely, unknown = (number("SoilClass", name) for name in ("Probability", "UnknownProbability"))
     record: dict[str, Any] = {
         "t": t,
         "window": _whole(number("WindowQuality", "Window")),
@@ -33,9 +37,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         "reason": value("SoilbusStatus", "Reason"),
         "soil": {name: both(message, "Value", "Std", unit) for name, (message, _, unit) in PARAMETER_FRAMES.items()},
         "bearing_pressure": both("SoilStrength", "BearingPressure", unit=1e3),
-        "soil_class": None
-        if kind is None
-        else {str(kind): number("SoilClass", "Probability"), "unknown": number("SoilClass", "UnknownProbability")},
+        "soil_class": None if kind is None else {str(kind): likely, "unknown": unknown},
         "slip": {dashboard.vehicle.name(i): dashboard.wheel_slip(i) for i in wheels},
         "sinkage": {dashboard.vehicle.name(i): _times(dashboard.wheel_sinkage(i), 1e-3) for i in wheels},
         "traversability": {
@@ -53,10 +55,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
             "max_draft_here": both("TractionLimits", "MaxDraft"),
             "max_grade_with_draft": both("TractionLimits", "MaxGrade"),
             "set_points": {
-                axle.lower(): {
-                    "efficiency": {"value": number("TractionAdvice", f"SlipForEfficiency{axle}"), "std": None},
-                    "pull": {"value": number("TractionAdvice", f"SlipForPull{axle}"), "std": None},
-                }
+                axle.lower(): {"efficiency": set_point(f"Efficiency{axle}"), "pull": set_point(f"Pull{axle}")}
                 for axle in ("Front", "Rear")
             },
             "forecast": {"slip": both("DemandForecast", "Slip")},
@@ -73,8 +72,7 @@ def received_record(dashboard: Dashboard, t: float | None) -> dict[str, Any]:
         "fault": dashboard.fault or None,
         "text": ". ".join(dashboard.sentences()) + ".",
     }
-    known_only: dict[str, Any] = known(record)
-    return known_only
+    return dict(known(record))
 
 
 def gist(record: dict[str, Any]) -> tuple[Any, ...]:

@@ -12,30 +12,16 @@ from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.configuration import no_slope
-from soilbus.report.page import Picture, Source, Step, page
-from soilbus.report.replay_pictures import (
-    STATES,
-    clock_text,
-    curve_pictures,
-    decision_picture,
-    map_pictures,
-    run_pictures,
-)
+from soilbus.report.page import Source, Step, page
+from soilbus.report.replay_pictures import STATES, clock_text, pictures
 from soilbus.report.windows import advice, by_reason, machine_line, of_use, why_of_no_use
 
 
 def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
     """Return the whole page of a replay, with the text of its summary."""
-    config, shown = source.config, list[tuple[str, Picture]]()
-    if results and config.table is not None:
-        shown = list(run_pictures(results))
-    elif results:
-        decision = "May the tractor go on, and how much could it pull?", decision_picture(results, config)
-        shown = [decision, *map_pictures(results), *curve_pictures(results, config)]
-    curves = (
-        "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate; its band is"
-        " 95 % wide."
-    )
+    config, shown = source.config, list(pictures(results, source.config) if results else ())
+    curves = "The strip above a curve is the decision. A curve is interrupted where a window gave no estimate"
+    curves += "; its band is 95 % wide."
     return page(
         "replay.html",
         source,
@@ -77,10 +63,8 @@ def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
     pressures = [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in used if r.bearing is not None]
     if pressures:
         value, std = np.array(pressures).T
-        yield (
-            f"The ground carried {_range(value, 'kPa')} (bearing pressure, in each window known to about "
-            f"± {2.0 * float(np.median(std)):.2g} kPa{doubtful})."
-        )
+        about = f"bearing pressure, in each window known to about ± {2.0 * float(np.median(std)):.2g} kPa{doubtful}"
+        yield f"The ground carried {_range(value, 'kPa')} ({about})."
     drafts = [d.value / 1e3 for r in used if (d := r.traversability.max_draft) is not None]
     pulled = [r.excitation.draft / 1e3 for r in results if r.excitation.draft is not None]
     if drafts:

@@ -57,7 +57,6 @@ STATUSES = {
     Status.INVALID: Look("invalid", "#ffffff", "xx", "o"),
 }
 
-
 FRICTION = (lambda r: None if r.posterior is None else r.posterior.parameters()["phi"]), math.radians(1.0)
 """The friction angle of a window, and the unit of its picture."""
 HOLD = "How well {} hold against shearing off?"
@@ -128,6 +127,16 @@ class TimeAxis:
         for begin in self.begins[1:]:
             axis.axvline(begin - self.space / 2.0, color="0.4", lw=0.8, ls=":")
         axis.set_xlabel(f"UTC, {day}" if day else "time of the log, s")
+
+
+def pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
+    """Yield the caption and picture of all that windows show, the decision first; of a test rig, of its runs."""
+    if config.table is not None:
+        yield from run_pictures(results)
+        return
+    yield "May the tractor go on, and how much could it pull?", decision_picture(results, config)
+    yield from map_pictures(results)
+    yield from curve_pictures(results, config)
 
 
 def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture:
@@ -237,17 +246,14 @@ def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
         for state, look in STATES.items():
             here = at[[r.traversability.state is state for r in placed]]
             if len(here):
-                axis.scatter(
-                    *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
-                )
+                shown = {"c": look.colour, "marker": look.marker, "label": look.name}
+                axis.scatter(*here.T, s=34, edgecolors="0.25", linewidths=0.5, **shown)
         axis.legend(loc="best")
         axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
         axis.set_aspect("equal", adjustable="datalim")
         axis.margins(0.08)
-        place = ", ".join(
-            f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
-            for i, angle in enumerate(first)
-        )
+        sides = zip(first, ("SN", "WE"), strict=True)
+        place = ", ".join(f"{abs(math.degrees(angle)):.5f}° {side[angle >= 0]}" for angle, side in sides)
         axis.set_xlabel(f"m east of the start ({place})")
         axis.set_ylabel("m north")
 

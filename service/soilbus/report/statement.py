@@ -118,19 +118,14 @@ def doubt(diagnosis: Diagnosis) -> str | None:
     """Why the finding is doubtful, or None."""
     found = []
     if not diagnosis.base.converged:  # it has too little evidence, so each effect seems to explain too much beside it
-        found.append(
-            "the fit of the present model did not converge, so evidence and names are a list of what to check,"
-            " no finding"
-        )
+        what = "so evidence and names are a list of what to check, no finding"
+        found.append(f"the fit of the present model did not converge, {what}")
     named = {addition.effect.name for addition in diagnosis.additions}
-    at_limits = {
-        f"{f.effect} ({f.parameter.name} {f.value:g})" for f in diagnosis.completed.at_limits if f.effect in named
-    }
-    if at_limits:  # the formula may be bent to what the catalogue lacks
-        found.append(
-            "at the edge of what is possible, where something that the catalogue lacks may push it:"
-            f" {', '.join(sorted(at_limits))}"
-        )
+    limits = [f for f in diagnosis.completed.at_limits if f.effect in named]
+    if limits:  # the formula may be bent to what the catalogue lacks
+        which = ", ".join(sorted({f"{f.effect} ({f.parameter.name} {f.value:g})" for f in limits}))
+        pushed = "where something that the catalogue lacks may push it"
+        found.append(f"at the edge of what is possible, {pushed}: {which}")
     found += [text for text in (_imitation(diagnosis), _held(diagnosis)) if text is not None]
     return "to be doubted: " + "; ".join(found) if found else None
 
@@ -141,10 +136,8 @@ def _imitation(diagnosis: Diagnosis) -> str | None:
     shares = zip(diagnosis.additions, diagnosis.imitation, strict=True)
     alone = ", ".join(f"{addition.effect.name} {100.0 * share:.0f} %" for addition, share in shares)
     against = [f"{a.effect.name}: {a.effect.ruled_out}" for a in diagnosis.additions if a.effect.ruled_out]
-    text = (
-        f"of what they explain together each alone explains {alone}; separate faults would add up to 100 %, so these"
-        " may be an imitation of something that the catalogue lacks"
-    )
+    text = f"of what they explain together each alone explains {alone}; separate faults would add up to 100 %"
+    text += ", so these may be an imitation of something that the catalogue lacks"
     if against:
         text += f". What rules them out: {'; '.join(against)}"
     if any(addition.effect.of_tyre for addition in diagnosis.additions):
@@ -178,10 +171,8 @@ def why_probabilities(addition: Addition) -> str | None:
     """How probabilities follow from the falls of the score; None where there is one name only."""
     if len(addition.by_block) < 2:
         return None
-    return (
-        "probabilities: each effect is judged by what it predicts of blocks that it was not fitted to, and a "
-        "probability is the share of random weights of the blocks for which it predicts best"
-    )
+    judged = "probabilities: each effect is judged by what it predicts of blocks that it was not fitted to"
+    return f"{judged}, and a probability is the share of random weights of the blocks for which it predicts best"
 
 
 def pressure_error(found: Detectable, before: Sequence[Posterior], config: Config) -> tuple[float, float]:
@@ -221,7 +212,5 @@ def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
         more = f" (and {len(unseen) - MAX_UNSEEN} more by less)" if len(unseen) > MAX_UNSEEN else ""
         what = ["sizes just below these"] * any(found.size is not None for found, _, _ in unseen)
         what += ["what they could not have shown"] * any(found.size is None for found, _, _ in unseen)
-        yield (
-            f"{' and '.join(what)} may move the bearing pressure by more than its "
-            f"+- {100.0 * unseen[0][2]:.1f} %: {', '.join(parts)}{more}"
-        )
+        moved = f"{' and '.join(what)} may move the bearing pressure by more than its +- {100.0 * unseen[0][2]:.1f} %"
+        yield f"{moved}: {', '.join(parts)}{more}"

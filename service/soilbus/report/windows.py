@@ -58,14 +58,12 @@ def summary_of(
     shows the slope, and `doubted` of messages that cannot be trusted.
     """
     good = [r for r in results if r.status is Status.VALID]
-    estimated = len(of_use(results)) - len(good)
+    estimated, unused = len(of_use(results)) - len(good), len(results) - len(of_use(results))
     lines = [f"{len(results)} windows from {heard}"]
-    unused = len(results) - len(of_use(results))
     lines.append(f"of use: {len(good)} valid, {estimated} with a doubtful estimate; of no use: {unused}")
-    if len(logs := grouped(results, lambda r: r.log or "")) > 1:
-        lines += [
-            f"  {log}: {len(of)} windows, {sum(r.status is Status.VALID for r in of)} valid" for log, of in logs.items()
-        ]
+    logs = grouped(results, lambda r: r.log or "")
+    for log, of in logs.items() if len(logs) > 1 else ():
+        lines.append(f"  {log}: {len(of)} windows, {sum(r.status is Status.VALID for r in of)} valid")
     for (status, reason), group in by_reason(results):
         lines.append(f"  {len(group):5d} {status}" + ("" if reason == "none" else f": {reason}"))
         if what := advice(group, good):
@@ -100,10 +98,9 @@ def machine_line(results: Sequence[WindowResult]) -> str | None:
     units = {"relaxation_length": "m", "wheel_inertia": "kg m^2"}
     value = {name: f"{of.value:.2g} +- {of.std:.2g} {units.get(name, 's')}" for name, of in found.items()}
     parts = [f"{name.replace('_', ' ')} {value[name]}" for name in units if name in value]
-    late = [
-        f"{name.removeprefix('lateness.').replace('_', ' ')} by {value[name]}" for name in value if name not in units
-    ]
-    return "of the machine: " + ", ".join(parts) + (f"; later than the torque: {', '.join(late)}" if late else "")
+    others = {name.removeprefix("lateness."): text for name, text in value.items() if name not in units}
+    late = ", ".join(f"{name.replace('_', ' ')} by {text}" for name, text in others.items())
+    return "of the machine: " + ", ".join(parts) + (f"; later than the torque: {late}" if late else "")
 
 
 def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
@@ -135,14 +132,9 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
         return said.format(", ".join(name for name in names if not name.startswith("(")))
     if kind == "input_missing":
         silent = ", ".join(name for name in names if name != "wheels")
-        parts = (
-            [f"no usable value of {silent} ever came: check the mapping, and that this bus carries it"]
-            if silent
-            else []
-        )
-        if "wheels" in names:
-            parts.append("no wheel that drives has a torque and a speed mapped, its own or its axle's")
-        return "; ".join(parts)
+        came = f"no usable value of {silent} ever came: check the mapping, and that this bus carries it"
+        wheels = "no wheel that drives has a torque and a speed mapped, its own or its axle's"
+        return "; ".join([came] * bool(silent) + [wheels] * ("wheels" in names))
     if kind == "not_excited":
         here, there = _draft(windows), _draft(valid)
         if here is None or there is None:

@@ -13,9 +13,8 @@ from collections.abc import Mapping
 from copy import copy
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.arrays import Array
+from soilbus.arrays import Array, Indices
 from soilbus.estimation.window import WHEEL_QUANTITIES, NoiseTable, Rig, Window, made_window
 from soilbus.sensors.options import RECEPTION, ReceptionOptions
 from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
@@ -100,7 +99,7 @@ class Bins:
         low, high = (round((t - self.origin) / self.bin_length) - self._first for t in (start, end))
         return max(low, 0), max(high, 0)
 
-    def _bins(self, samples: Samples) -> NDArray[np.intp]:
+    def _bins(self, samples: Samples) -> Indices:
         return np.floor(samples.t / self.bin_length + 1e-9).astype(np.intp) - self._first
 
     def _taken(self, high: int) -> Samples:

@@ -24,16 +24,7 @@ from soilbus.arrays import Array, Mask
 from soilbus.can.channels import Channel
 from soilbus.config.model import Estimator
 from soilbus.estimation.instrumentation import completed
-from soilbus.estimation.window import (
-    VEHICLE_QUANTITIES,
-    WHEEL_QUANTITIES,
-    Rig,
-    SensorNoise,
-    Window,
-    pull_given,
-    turning,
-    zero_if_unknown,
-)
+from soilbus.estimation.window import Rig, SensorNoise, Window, pull_given, turning, zero_if_unknown
 from soilbus.sensors.bins import bin_means
 from soilbus.sensors.options import CONSISTENCY, ConsistencyOptions
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
@@ -176,7 +167,7 @@ def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
 def frozen(data: ConsistencyInput) -> Iterator[str]:
     """Yield channels that read the very same for longer than their noise allows, while the vehicle drives."""
     window, rig, rare = data.raw, data.rig, 1.0 - data.options.usual_share
-    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+    quantities = list(dict.fromkeys(name.partition(".")[0] for name in rig.channels))
     value = np.column_stack([getattr(window, q) for q in quantities])
     same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
     same &= data.driving[1:, None]
@@ -196,8 +187,7 @@ def frozen(data: ConsistencyInput) -> Iterator[str]:
 def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolution, probability: float) -> bool:
     """Whether noise leaves a reading the same in bins of these variances (N,) with less than this probability.
 
-    At most, where the truth is in the middle of the reading's step, noise leaves one sample
-    in it with the chance erf(step / (2 sqrt(2) sd)).
+    Noise leaves a sample in the reading's step with the chance erf(step / (2 sqrt(2) sd)) at most.
     """
     of_sample = noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * value**2
     if of_sample == 0.0 or not np.all(variance > 0.0):  # exact: no sensor's, such as a draft that is known to be 0
@@ -255,9 +245,8 @@ def load_sum(data: ConsistencyInput) -> Iterator[str]:
     is_carried = min(abs(front), abs(rear)) > options.load_error
     if is_carried or not len(bad) == len(sound) == 2:
         return
-    left, other = (
-        median(window.load[wrong][:, pair[0]] / window.load[wrong][:, pair].sum(axis=1)) for pair in (bad, sound)
-    )
+    load = window.load[wrong]
+    left, other = (median(load[:, pair[0]] / load[:, pair].sum(axis=1)) for pair in (bad, sound))
     if abs(left - other) > options.load_error:
         yield f"load.{rig.wheels[bad[int((left > other) != (front + rear > 0.0))]]}"
 

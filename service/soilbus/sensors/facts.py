@@ -18,6 +18,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward, turning
+from soilbus.grouping import grouped
 from soilbus.sensors.bins import Bins, bin_means
 from soilbus.sensors.consistency import change, without
 from soilbus.terra.vehicle import slip_ratio
@@ -48,11 +49,9 @@ class Limits:
     """Samples of a wheel's channel in a bin below which the bin holds a value of one instant; twice as many of another
     are a mean, and with loads that shake the two then differ."""
     weight: float = 0.15
-    """Share of the weight by which the loads, or an axle's, may differ (fuel, driver, freight); half of it is a
-    warning."""
+    """Share of the weight by which loads may differ (fuel, driver, freight); half of it gives a warning."""
     skid: float = 0.2
-    """Largest median slip below zero of any wheel: those towed through soft soil skid by 0.1 to 0.2 (Wong 2008, ch. 4).
-    Above `idle_slip` the radius of a wheel that rolls freely is in doubt."""
+    """Largest median slip below zero of any wheel: those towed through soft soil skid by 0.1 to 0.2 (Wong 2008)."""
     wheel_apart: float = 0.15
     """Difference of one wheel's median slip from the median of all."""
     never_less: float = 0.45
@@ -62,15 +61,13 @@ class Limits:
     scale: tuple[float, float] = (0.6, 1.3)
     """Range of what one force, load or speed changes by when another changes by one."""
     excited: float = 0.008
-    """Sd of the draft's changes within 1 s, or of an axle's thrust, as a share of the weight, below which the balance
-    or the slip cannot be decided."""
+    """Sd of changes of draft or thrust within 1 s, over the weight [1], below which balance and slip stay open."""
     rolling: float = 0.05
     """Thrust over weight [1] up to which wheels only roll: tyres have 0.02 to 0.05 on firm ground (Wong 2008)."""
     most_thrust: float = 0.9
     """Largest median thrust over weight that soil can bear for long."""
     tilted: float = 0.004
-    """Sd of the slope [rad] from which it shows whether an accelerometer feels gravity: four times the sensor's own
-    noise (`noise.pitch`)."""
+    """Sd of the slope [rad] that shows whether an accelerometer feels gravity: four times `noise.pitch`."""
     side_sd: float = 4.0
     """Standard deviations by which a regression coefficient must have the wrong sign, or lie outside `scale`."""
     jump: float = 0.3
@@ -106,20 +103,18 @@ def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns
 
     admission: of the channels wanted, it is fed and emptied; frames: of one recording.
     """
-    parts: list[dict[str, list[Column]]] = [{}]
+    parts: list[list[tuple[str, Column]]] = [[]]
     refused: Counter[tuple[str, Reason]] = Counter()
     n = 0
 
     def take() -> None:
         decoded = admission.take()
         refused.update({key: len(t) for key, t in decoded.refused.items()})
-        for name, column in decoded.columns.items():
-            if len(column.t):
-                parts[-1].setdefault(name, []).append(column)
+        parts[-1].extend((name, column) for name, column in decoded.columns.items() if len(column.t))
 
     def begin_part() -> None:
         take()
-        parts.append({})
+        parts.append([])
 
     admission.at_break = begin_part
     for n, (t, identifier, extended, data, remote, error) in enumerate(frames, 1):
@@ -128,12 +123,9 @@ def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns
         if n % BATCH_SIZE == 0:
             take()
     take()
-    longest = max(parts, key=lambda part: sum(len(c.t) for columns in part.values() for c in columns))
-    joined = {
-        name: (np.concatenate([c.t for c in columns]), np.concatenate([c.value for c in columns]))
-        for name, columns in longest.items()
-    }
-    return joined, refused, n
+    longest = grouped(max(parts, key=lambda part: sum(len(c.t) for _, c in part)), lambda named: named[0])
+    times = {name: np.concatenate([c.t for _, c in columns]) for name, columns in longest.items()}
+    return {name: (t, np.concatenate([c.value for _, c in longest[name]])) for name, t in times.items()}, refused, n
 
 
 class Facts:

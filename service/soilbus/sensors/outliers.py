@@ -17,12 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.arrays import Array, Mask
+from soilbus.arrays import Array, Indices, Mask
 from soilbus.sensors.options import RECEPTION, ReceptionOptions
 
-Sd = Callable[[NDArray[np.intp], Array, Array], Array]
-"""Sd (N,) of samples, channel after channel, from each channel's number of them (C,), their expected
-magnitudes (N,) and the channels' mean magnitudes (C,)."""
 OUTLIER = "outlier"
 """Reason under which outliers are counted."""
 SIDE = 4
@@ -40,18 +37,18 @@ class Samples(NamedTuple):
     value: Array
     settled: Mask
 
-    def pick(self, which: Mask | NDArray[np.intp]) -> Samples:
+    def pick(self, which: Mask | Indices) -> Samples:
         """Return the samples of a mask (N,) or of indices."""
         return Samples(self.column[which], self.t[which], self.value[which], self.settled[which])
 
 
 def outlier_test(
-    samples: Samples, sd: Sd, options: ReceptionOptions = RECEPTION
-) -> tuple[Samples, Mask, NDArray[np.intp]]:
+    samples: Samples, sd: Callable[[Indices, Array, Array], Array], options: ReceptionOptions = RECEPTION
+) -> tuple[Samples, Mask, Indices]:
     """Return samples in order, which of them are outliers, and how many of their channel follow each one; each (N,).
 
-    A channel with fewer than nine samples is not judged; the first and last four of the
-    others are judged by the line nearest to them.
+    sd: of the samples (N,), by the number in each channel (C,), expected magnitudes (N,), their means by channel (C,).
+    A channel of fewer than nine is not judged; the first and last four of others by the line nearest to them.
     """
     samples = samples.pick(np.lexsort((samples.value, samples.t, samples.column)))
     column, t, value, _ = samples
@@ -94,9 +91,7 @@ def _lines(t: Array, value: Array) -> Array:
     return np.stack([slope, *(before + after) * 0.5])
 
 
-def _vibration(
-    value: Array, noise: Array, begin: NDArray[np.intp], end: NDArray[np.intp], column: NDArray[np.int16]
-) -> Array:
+def _vibration(value: Array, noise: Array, begin: Indices, end: Indices, column: NDArray[np.int16]) -> Array:
     """How many sd of the noise the second differences of these columns (M,) show.
 
     value[begin:end], of (C,), are the samples of one column.

@@ -20,16 +20,14 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.arrays import Array
+from soilbus.arrays import Array, Indices
 from soilbus.estimation.local_cubics import PHASE_PARTS, Curve, curve_of, variance_of_one
 from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 
 NEEDED = ("torque", "load", "speed", "ground_speed", "draft")
 """Quantities without which the model has no residual."""
-
 
 _Channel = tuple[Array, Curve]
 """Values (N,) of the samples of one channel, and their curve, which has their times from the store's origin."""
@@ -80,7 +78,7 @@ def _lost(channel: _Channel, length: float, n: int) -> float:
     return 1.0 - float(worth.sum() / samples.sum()) if len(bins) else 0.0
 
 
-def _binned(channel: _Channel, length: float, n: int) -> tuple[NDArray[np.intp], Array, Array, Array]:
+def _binned(channel: _Channel, length: float, n: int) -> tuple[Indices, Array, Array, Array]:
     """Of the bins 0..n-1 from time 0 on that have samples (B,): number, samples, value at the centre, their worth."""
     value, curve = channel
     number = np.floor(curve.t / length + 1e-9).astype(np.intp)

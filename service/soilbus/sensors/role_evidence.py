@@ -10,8 +10,7 @@ radius less slip            median(v / omega)
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -21,7 +20,7 @@ from cantools.database.can import Database
 from soilbus.arrays import Array
 from soilbus.can.admission import Admission
 from soilbus.can.candump import Frame
-from soilbus.can.channels import Channel, Reason
+from soilbus.can.channels import Channel
 from soilbus.can.decode import check_decodable
 from soilbus.can.role_matching import ASSERTED, WHEELS, Assignment, Candidate, Slot, axles_of
 from soilbus.can.units import STANDARD_GRAVITY
@@ -36,8 +35,7 @@ LEAST_BINS = 50
 MOVING = 0.2
 """Ground speed [m/s] from which the vehicle moves: `estimator.min_speed`."""
 RIGID = 0.006
-"""Relative sd of the ratio of two speeds up to which they belong to parts that turn together; slip has ten times as
-much."""
+"""Largest relative sd of the ratio of two speeds of parts that turn together; slip has ten times as much."""
 SAME_GEAR = 0.02
 """Relative difference of two measured gear ratios up to which they are one: gain errors; gear steps are larger."""
 ABSENT, REFUSED = 0.9, 0.6
@@ -47,7 +45,7 @@ MOVES_WITH = 0.7
 
 
 class Recording:
-    """Samples (SI, no gear) and refused values of candidate signals by `Message.Signal`; its begin and length [s]."""
+    """Samples (SI, no gear) and numbers of refused values of signals by `Message.Signal`; its begin and length [s]."""
 
     def __init__(self, found: Iterable[Candidate], database: Database, frames: Iterable[Frame]) -> None:
         channels: dict[str, Channel] = {}
@@ -58,10 +56,7 @@ class Recording:
                 with suppress(ValueError):
                     check_decodable(message, c.signal)
                     channels[c.path] = Channel(c.path, "", c.message, c.signal, c.factor, 0.0, -math.inf, math.inf)
-        self.columns, by_reason, _ = longest_part(Admission(channels.values(), database), frames)
-        self.refused = Counter[str]()
-        for (path, reason), n in by_reason.items():
-            self.refused[path] += n * (reason != Reason.BAD_TIME)
+        self.columns, self.refused, _ = longest_part(Admission(channels.values(), database), frames)
         self.start = min((float(t[0]) for t, _ in self.columns.values()), default=0.0)
         self.seconds = max((float(t[-1]) for t, _ in self.columns.values()), default=0.0) - self.start
 
@@ -89,13 +84,12 @@ class Facts:
     axle: str = ""
 
 
-def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]:
+def weighed(found: Sequence[Candidate], recording: Recording) -> list[Candidate]:
     """Return the candidates with what the recording says for or against each."""
-    known, out = list(found), []
-    turning = _turning(known, recording)
-    for c in known:
+    turning, out = _turning(found, recording), []
+    for c in found:
         if c.path not in recording.columns:
-            refused = recording.refused[c.path]
+            refused = sum(n for (path, _), n in recording.refused.items() if path == c.path)
             what = f"never available in {refused} frames" if refused else "no frame of it in the log"
             out.append(replace(c.changed(-REFUSED if refused else -ABSENT, what), absent=True))
             continue
@@ -154,9 +148,6 @@ def facts_of(assignment: Assignment, recording: Recording) -> Facts:
             if len(value) >= LEAST_BINS and np.median(np.sign(value)) < 0.0:
                 facts.backward[c.path] = f"{np.mean(value < 0.0):.0%} of the drive"
     return facts
-
-
-# --- one question each ---
 
 
 def _turning(found: Iterable[Candidate], recording: Recording) -> Array:

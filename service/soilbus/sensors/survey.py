@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -103,9 +103,6 @@ def survey(config: Config, database: Database, frames: Iterable[Frame]) -> Surve
     return Survey(seen, tuple(findings), tuple(questions))
 
 
-# --- decoding ---
-
-
 def _with_motor_speeds(config: Config, database: Database) -> list[Wheel]:
     """The wheels, with an unmapped motor speed added where the torque's message has exactly one."""
     wheels = []
@@ -116,8 +113,7 @@ def _with_motor_speeds(config: Config, database: Database) -> list[Wheel]:
             turns = [f"{name}.{s.name}" for s in signals if _dimension(s.unit) == "rotation"]
             mapped = {given.signal for given in (wheel.torque, wheel.speed) if given is not None}
             if len(turns) == 1 and turns[0] not in mapped:
-                signal = Signal(signal=turns[0], sign=wheel.torque.sign)
-                wheel = wheel.model_copy(update={"motor_speed": signal})
+                wheel = wheel.model_copy(update={"motor_speed": Signal(signal=turns[0], sign=wheel.torque.sign)})
         wheels.append(wheel)
     return wheels
 
@@ -127,9 +123,6 @@ def _dimension(unit: str | None) -> str:
     with suppress(ValueError):
         return known.dimension if (known := unit_of(unit)) is not None else ""
     return ""
-
-
-# --- one signal by itself ---
 
 
 _REFUSAL: Mapping[Reason, str] = {
@@ -144,7 +137,6 @@ _REFUSAL: Mapping[Reason, str] = {
     Reason.BAD_COUNTER: "its Counter stands still, or is another maker's (dbc.checked, dbc/README.md)",
     Reason.WRONG_LENGTH: "frames of another length than the DBC says",
     Reason.TIME_BACKWARDS: "stamps that run backwards",
-    Reason.BAD_TIME: "stamps that are no times",
 }
 
 
@@ -176,10 +168,8 @@ def _of_several_senders(channels: Iterable[Channel], counts: Counts) -> Iterator
         if addresses := sorted(counts.senders.get(name, ())):
             keys = ", ".join(channel.key for channel in members)
             heard = " and ".join(f"{address:#04x}" for address in addresses)
-            yield Finding(
-                f"{keys}: {name} comes from the source addresses {heard}, and the one heard first counts: put the one"
-                f" that you mean into the identifier of a DBC of your own", False,
-            )  # fmt: skip
+            text = f"{keys}: {name} comes from the source addresses {heard}, and the one heard first counts"
+            yield Finding(f"{text}: put the one that you mean into the identifier of a DBC of your own", False)
 
 
 def _of_one(seen: Seen, database: Database) -> Iterator[Finding]:
@@ -227,11 +217,9 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config) -> I
         typical = float(np.median(np.abs(jumps)))
         alike = float((jumps**2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
         if typical > max(LIMITS.jump_sd * sd, LIMITS.jump * size) and alike > 0.5:
-            text = (
-                f"jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times its noise: is"
-                f" the byte order (Intel, Motorola) or the start bit of {s.channel.path} right in the DBC?"
-            )
-            yield fault(f"{s.channel.key}: {text}", name)
+            jumps_by = f"jumps by {typical:.3g} {s.unit} from one value to the next, {typical / sd:.0f} times its noise"
+            why = f"is the byte order (Intel, Motorola) or the start bit of {s.channel.path} right in the DBC?"
+            yield fault(f"{s.channel.key}: {jumps_by}: {why}", name)
 
 
 def _too_slow_to_measure(heard: Columns, config: Config) -> Iterator[Finding]:
@@ -247,12 +235,10 @@ def _too_slow_to_measure(heard: Columns, config: Config) -> Iterator[Finding]:
     longest = max((float(t[end - 1] - t[begin]) for begin, end in runs(creeps)), default=0.0)
     if least > config.estimator.min_speed and longest > settings.stuck_time:
         enough = math.ceil(20.0 * float(rim[~moves].max())) / 20.0
-        yield Finding(
-            f"signals.ground_speed: reads 0 for up to {longest:.1f} s while the wheels turn, and else never less than"
-            f" {least:.2g} m/s: a vehicle that creeps passes for one that is stuck; if the sensor measures no slower"
-            f" speed, set estimator.min_speed = {enough:.2f}",
-            False,
-        )
+        reads = f"reads 0 for up to {longest:.1f} s while the wheels turn, and else never less than {least:.2g} m/s"
+        mend = f"if the sensor measures no slower speed, set estimator.min_speed = {enough:.2f}"
+        passes = "a vehicle that creeps passes for one that is stuck"
+        yield Finding(f"signals.ground_speed: {reads}: {passes}; {mend}", False)
 
 
 def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
@@ -263,19 +249,14 @@ def _mixed_rates(seen: Iterable[Seen], config: Config) -> Iterator[Finding]:
     slow, fast = (by(wheels, key=lambda s: s.rate) for by in (min, max))
     present, length = config.estimator.bin, min(max(1.0 / fast.rate, SHORT_BIN), 0.5 / slow.rate)
     if slow.rate * present < LIMITS.instant and fast.rate * present >= 2.0 * LIMITS.instant and length < present:
-        yield Finding(
-            f"{slow.channel.key}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {fast.channel.key}: in"
-            f" bins of {present:g} s a mean stands beside a value of one instant, and loads that shake bias the soil;"
-            f" set estimator.bin = {length:.2g}",
-            False,
-        )
-
-
-# --- signals compared with each other ---
+        rates = f"{slow.channel.key}: {slow.rate:.3g} values a second beside {fast.rate:.3g} of {fast.channel.key}"
+        mean = f"in bins of {present:g} s a mean stands beside a value of one instant"
+        shakes = f"loads that shake bias the soil; set estimator.bin = {length:.2g}"
+        yield Finding(f"{rates}: {mean}, and {shakes}", False)
 
 
 @np.errstate(invalid="ignore", divide="ignore")  # of values that are not known
-def _compare(facts: Facts, findings: list[Finding], channels: Iterable[Channel], database: Database) -> list[str]:
+def _compare(facts: Facts, findings: list[Finding], channels: Sequence[Channel], database: Database) -> list[str]:
     """Add what checks find, each without the channels that an earlier one has named; return open questions."""
     facts = facts.less(name for f in findings for name in f.channels)
     if facts.straight.sum() < facts.bins(LIMITS.least_seconds):
@@ -296,18 +277,17 @@ def _compare(facts: Facts, findings: list[Finding], channels: Iterable[Channel],
     return questions
 
 
-def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database) -> Iterator[Finding]:
+def _contradictions(facts: Facts, channels: Sequence[Channel], database: Database) -> Iterator[Finding]:
     """Sensors that contradict the others in many windows, by the checks of `consistency`."""
-    rig, listed = facts.rig, list(channels)
-    resolution = {c.name: resolution_of(c, database) for c in listed}
-    is_mapped = np.array([f"motor_speed.{w}" in facts.mapped for w in rig.wheels])
-    motor = np.where(is_mapped, np.abs(facts.motor), np.nan)
-    n, all_rows = facts.bins(facts.config.estimator.window), np.arange(len(facts.window.t))
-    parts = [all_rows[begin : begin + n] for begin in range(0, max(len(all_rows) - n, 0) + 1, n)]
+    rig, settings = facts.rig, facts.config.estimator
+    resolution = {c.name: resolution_of(c, database) for c in channels}
+    motor = np.abs(facts.less({f"motor_speed.{w}" for w in rig.wheels} - facts.mapped).motor)
+    n, end = facts.bins(settings.window), len(facts.window.t)
+    parts = [slice(begin, begin + n) for begin in range(0, max(end - n, 0) + 1, n)]
     named: Counter[str] = Counter()
     for rows in parts:
-        named.update(implausible(facts.window.rows(rows), rig, facts.config.estimator, resolution, motor[rows]))
-    keys = {c.name: c.key for c in listed}
+        named.update(implausible(facts.window.rows(rows), rig, settings, resolution, motor[rows]))
+    keys = {c.name: c.key for c in channels}
     for name, count in named.items():
         if count > max(LIMITS.windows * len(parts), 1.0):
             text = f"{keys.get(name, name)}: contradicts the other sensors in {count} of {len(parts)} windows"

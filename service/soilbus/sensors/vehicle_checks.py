@@ -31,7 +31,7 @@ from soilbus.grouping import grouped
 from soilbus.sensors.consistency import change, median, moving_sum
 from soilbus.sensors.facts import LIMITS, Facts, Finding, UndecidableError, changes, fault, regression, settled
 from soilbus.sensors.options import CONSISTENCY
-from soilbus.terra.vehicle import GRAVITY, axle_loads
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 
 
 def _weight(facts: Facts) -> Iterator[Finding]:
@@ -44,34 +44,28 @@ def _weight(facts: Facts) -> Iterator[Finding]:
     weight, measured = chassis.mass * GRAVITY, median(window.load.sum(axis=1) / np.cos(zero_if_unknown(window.pitch)))
     if not math.isfinite(measured):
         raise UndecidableError("not every wheel load is known: the loads cannot be compared with the mass")
-    off, names = abs(measured / weight - 1.0), [f"load.{w}" for w in rig.wheels]
+    share, names = measured / weight, [f"load.{w}" for w in rig.wheels]
+    off = abs(share - 1.0)
     if off > LIMITS.weight / 2.0:
-        why = (
-            _likely(FACTORS, measured / weight, 0.96, 1.04)
-            or "which of them is wrong? (ballast, unit or scale of the loads)"
-        )
-        text = (
-            f"the wheel loads sum to {measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg, but"
-            f" vehicle.mass = {chassis.mass:g} kg: {why}"
-        )
+        why = _likely(FACTORS, share, 0.96, 1.04) or "which of them is wrong? (ballast, unit or scale of the loads)"
+        has = f"{measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg"
+        text = f"the wheel loads sum to {has}, but vehicle.mass = {chassis.mass:g} kg: {why}"
         yield fault(text, *names) if off > LIMITS.weight else Finding(text, False)
         return
-    has, due = _axle_loads(facts)
-    if set(rig.front.tolist()) == {True, False} and abs(has[0] - due[0]) > LIMITS.weight * weight:
+    (front, rear), (front_due, rear_due) = _axle_loads(facts, chassis)
+    if set(rig.front.tolist()) == {True, False} and abs(front - front_due) > LIMITS.weight * weight:
         between = "axles between them count on both by their place; " if len(rig.axles) > 2 else ""
-        text = (
-            f"the front wheels carry {has[0] / 1e3:.1f} kN and the rear wheels {has[1] / 1e3:.1f} kN, where mass,"
-            f" centre of gravity and draft give {due[0] / 1e3:.1f} and {due[1] / 1e3:.1f} kN: {between}"
-            "cg_ahead_of_rear_axle, loads of swapped wheels, or a draft of the wrong sign or size?"
-        )
-        is_swapped = abs(has[0] - due[1]) < LIMITS.weight * weight
+        carry = f"the front wheels carry {front / 1e3:.1f} kN and the rear wheels {rear / 1e3:.1f} kN"
+        give = f"mass, centre of gravity and draft give {front_due / 1e3:.1f} and {rear_due / 1e3:.1f} kN"
+        why = f"{between}cg_ahead_of_rear_axle, loads of swapped wheels, or a draft of the wrong sign or size?"
+        is_swapped = abs(front - rear_due) < LIMITS.weight * weight
+        text = f"{carry}, where {give}: {why}"
         yield fault(text, *names) if is_swapped else Finding(text, False)
 
 
-def _axle_loads(facts: Facts) -> tuple[list[float], list[float]]:
+def _axle_loads(facts: Facts, chassis: Chassis) -> tuple[list[float], list[float]]:
     """Medians of the loads [N] on the front and rear axle, and what these should be by moments."""
-    window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
-    assert chassis is not None
+    window, rig = facts.window, facts.rig
     known = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
     due = [median(np.broadcast_to(load, window.t.shape)) for load in axle_loads(chassis, *known)]
     return [median(window.load @ share) for share in (rig.ahead, 1.0 - rig.ahead)], due
@@ -84,20 +78,14 @@ def _one_axle(facts: Facts) -> Iterator[Finding]:
     weighed = [axle for axle in ("front", "rear") if f"load.{axle}" in facts.mapped]
     if chassis is None or len(weighed) != 1 or facts.mapped & {*names} or set(rig.front.tolist()) != {True, False}:
         return
-    has, due = (pair[weighed[0] == "rear"] for pair in _axle_loads(facts))
-    why = _likely(FACTORS, has / due, 1.0 - LIMITS.weight, 1.0 + LIMITS.weight) if _log_off(has / due) > 1.0 else ""
-    if why:
-        yield fault(
-            f"axle.{weighed[0]}.load: {has / 1e3:.1f} kN, where mass, centre of gravity and draft give"
-            f" {due / 1e3:.1f} kN: {why}",
-            *names,
-        )
+    has, due = (pair[weighed[0] == "rear"] for pair in _axle_loads(facts, chassis))
+    why = _likely(FACTORS, has / due, 1.0 - LIMITS.weight, 1.0 + LIMITS.weight)
+    if why and _log_off(has / due) > 1.0:
+        given = f"where mass, centre of gravity and draft give {due / 1e3:.1f} kN"
+        yield fault(f"axle.{weighed[0]}.load: {has / 1e3:.1f} kN, {given}: {why}", *names)
     elif has > (1.0 + LIMITS.weight) * chassis.mass * GRAVITY:
-        yield fault(
-            f"the {weighed[0]} axle alone carries {has / 1e3:.1f} kN, more than the weight of vehicle.mass ="
-            f" {chassis.mass:g} kg: mass, or unit or scale of the load?",
-            *names,
-        )
+        more = f"{has / 1e3:.1f} kN, more than the weight of vehicle.mass = {chassis.mass:g} kg"
+        yield fault(f"the {weighed[0]} axle alone carries {more}: mass, or unit or scale of the load?", *names)
 
 
 def _transfer(facts: Facts) -> Iterator[Finding]:
@@ -115,11 +103,9 @@ def _transfer(facts: Facts) -> Iterator[Finding]:
         return
     (share,), (sd,) = regression(rows[:, 0], rows[:, 1:])
     if share < LIMITS.scale[0] - LIMITS.side_sd * sd:
-        yield fault(
-            f"load moves between front and rear wheels {share:.2f} times as much as draft, slope and inertia move it:"
-            " are loads of front and rear wheels swapped, or is hitch_height or cg_height wrong?",
-            *cells,
-        )
+        what = f"load moves between front and rear wheels {share:.2f} times as much as draft, slope and inertia move it"
+        why = "are loads of front and rear wheels swapped, or is hitch_height or cg_height wrong?"
+        yield fault(f"{what}: {why}", *cells)
 
 
 def _log_off(ratio: float) -> float:
@@ -138,7 +124,6 @@ FACTORS = {
 }
 """The likely mistake where the loads sum up to this multiple of the weight."""
 
-
 FASTER = {
     30.0 / math.pi: "are the wheel speeds in rpm where the DBC says rad/s, ",
     3.6: "is the ground speed in m/s where the DBC says km/h, ",
@@ -148,6 +133,8 @@ FASTER = {
 }
 """The likely mistake where rims seem to run this many times as fast as the ground."""
 
+OTHER_SIDE = "torques measured at the other side of the gear"
+
 
 def _likely(mistakes: Mapping[float, str], ratio: float, least: float, most: float) -> str:
     """The mistake that makes this multiple, to such a factor; "" if there is none."""
@@ -156,8 +143,7 @@ def _likely(mistakes: Mapping[float, str], ratio: float, least: float, most: flo
 
 def _directions(facts: Facts) -> Iterator[Finding]:
     """Wheels that turn or drive in the opposite direction to most."""
-    rig, raw = facts.rig, facts.raw
-    moving = facts.straight
+    rig, raw, moving = facts.rig, facts.raw, facts.straight
     turns = [median(np.sign(raw.speed[moving, i])) for i in range(len(rig.wheels))]
     forward_sign = np.sign(np.nansum(turns))
     for wheel, turn in zip(rig.wheels, turns, strict=True):
@@ -176,8 +162,7 @@ def _directions(facts: Facts) -> Iterator[Finding]:
             yield fault(text, f"torque.{axle}", *(f"torque.{wheel}" for wheel in wheels))
     for wheel in braking if drives > 0.0 else ():
         yield fault(f"wheel.{wheel}.torque: brakes while most wheels drive: sign = -1?", f"torque.{wheel}")
-    ground = median(np.sign(raw.ground_speed[moving]))
-    if ground < 0.0 and forward_sign > 0.0:
+    if forward_sign > 0.0 and median(np.sign(raw.ground_speed[moving])) < 0.0:
         text = "signals.ground_speed: backward while the wheels turn forward: sign = -1?"
         yield fault(text, "ground_speed")
 
@@ -192,10 +177,8 @@ def _gears(facts: Facts) -> Iterator[Finding]:
     for i, wheel in enumerate(facts.rig.wheels):
         own = next(w for w in facts.config.wheel if w.name == wheel)
         ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
-        is_own = (
-            f"motor_speed.{wheel}" not in facts.mapped and _log_off(own.gear_ratio * ratio) < CONSISTENCY.gear_slack
-        )
-        if own.motor_speed is not None and not is_own:
+        is_own = _log_off(own.gear_ratio * ratio) < CONSISTENCY.gear_slack
+        if own.motor_speed is not None and (f"motor_speed.{wheel}" in facts.mapped or not is_own):
             ratios.append((f"wheel.{wheel}", own, ratio, [wheel], "the wheel"))
     for axle in facts.config.axle:
         names = [w.name for w in facts.config.wheel if w.axle == axle.name and w.speed is not None]
@@ -212,12 +195,10 @@ def _gears(facts: Facts) -> Iterator[Finding]:
         if not math.isfinite(ratio) or _log_off(ratio) < CONSISTENCY.gear_slack or of.motor_speed is None:
             continue
         radius = " radius (the wheels' speeds are in m/s)," if facts.by_radius & set(names) else ""
-        yield fault(
-            f"{key}.gear_ratio = {of.gear_ratio:g}, but {of.motor_speed.signal} turns {of.gear_ratio * ratio:.4g} times"
-            f" as fast as {what}: gear ratio,{radius} or unit or byte order of one of the speeds?",
-            f"torque.{of.name}",
-            f"{'motor_speed' if isinstance(of, Wheel) else 'speed'}.{of.name}",
-        )
+        turns = f"{of.motor_speed.signal} turns {of.gear_ratio * ratio:.4g} times as fast as {what}"
+        text = f"{turns}: gear ratio,{radius} or unit or byte order of one of the speeds?"
+        speed = f"{'motor_speed' if isinstance(of, Wheel) else 'speed'}.{of.name}"
+        yield fault(f"{key}.gear_ratio = {of.gear_ratio:g}, but {text}", f"torque.{of.name}", speed)
     for axle in facts.config.axle:
         both = [w for w in facts.config.wheel if w.axle == axle.name and w.driven and w.speed is not None]
         if axle.differential != "locked" or len(both) != 2:
@@ -225,11 +206,9 @@ def _gears(facts: Facts) -> Iterator[Finding]:
         one, other = (facts.raw.speed[:, facts.rig.wheels.index(w.name)] for w in both)
         apart = median(np.abs(one / other - 1.0)[facts.straight])
         if apart > CONSISTENCY.gear_slack / 2.0:
-            yield fault(
-                f'axle.{axle.name}.differential = "locked", but the speeds of {both[0].name} and {both[1].name} differ'
-                f' by {apart:.1%} straight on: "open" or "limited"?',
-                *(f"speed.{w.name}" for w in both),
-            )
+            text = f"the speeds of {both[0].name} and {both[1].name} differ by {apart:.1%} straight on"
+            key = f'axle.{axle.name}.differential = "locked"'
+            yield fault(f'{key}, but {text}: "open" or "limited"?', *(f"speed.{w.name}" for w in both))
 
 
 def _free_wheels(facts: Facts) -> Iterator[Finding]:
@@ -238,20 +217,17 @@ def _free_wheels(facts: Facts) -> Iterator[Finding]:
     for i, wheel in enumerate(facts.rig.wheels):
         slip = median(facts.slip[:, i])
         if wheel in free and (slip < -LIMITS.skid or slip > LIMITS.idle_slip):
-            text = (
-                f"wheel.{wheel}: rolls freely, but its rim goes {1.0 / (1.0 - slip):.2f} times as fast as the ground:"
-                " radius, or unit of its speed or of the ground speed?"
-            )
+            goes = f"its rim goes {1.0 / (1.0 - slip):.2f} times as fast as the ground"
+            text = f"wheel.{wheel}: rolls freely, but {goes}: radius, or unit of its speed or of the ground speed?"
             yield fault(text, f"speed.{wheel}") if abs(slip) > LIMITS.skid else Finding(text, False)
 
 
 def _slips(facts: Facts) -> Iterator[Finding]:
     """Rim speeds against the ground speed and against each other."""
-    slip, rig = facts.slip, facts.rig
-    speeds = [f"speed.{w}" for w in rig.wheels]
+    slip, wheels = facts.slip, facts.rig.wheels
+    speeds = [f"speed.{w}" for w in wheels]
     drives = np.where(facts.thrust > 0.0, slip, np.nan)
-    usual = {wheel: median(drives[:, i]) for i, wheel in enumerate(rig.wheels)}
-    usual = {wheel: own for wheel, own in usual.items() if math.isfinite(own)}
+    usual = {w: own for i, w in enumerate(wheels) if math.isfinite(own := median(drives[:, i]))}
     if not usual:
         raise UndecidableError("no slip is known: wheel and ground speeds cannot be compared")
     least, middle = float(np.nanquantile(slip, 0.05)), float(np.median(list(usual.values())))
@@ -262,22 +238,17 @@ def _slips(facts: Facts) -> Iterator[Finding]:
         factor = 1.0 / (1.0 - (middle if is_pushed else least))
         who = "driving wheels seem" if is_pushed else "the wheels seem"
         never = "" if is_pushed else f", never by less than {least:.2f}"
-        why = _likely(FASTER, factor, 0.95, 1.7)  # slip of up to 0.4 included
-        yield fault(
-            f"{who} to slip by {middle:.2f}{never}: their rims go {factor:.2f} times as fast as the ground:"
-            f" {why}{gear}radius, or unit, sign or byte order of ground and wheel speeds?",
-            "ground_speed",
-            *speeds,
-        )
+        goes = f"their rims go {factor:.2f} times as fast as the ground"
+        why = _likely(FASTER, factor, 0.95, 1.7) + gear  # slip of up to 0.4 included
+        wrong = f"{why}radius, or unit, sign or byte order of ground and wheel speeds?"
+        yield fault(f"{who} to slip by {middle:.2f}{never}: {goes}: {wrong}", "ground_speed", *speeds)
         return
     apart = {wheel: own for wheel, own in usual.items() if abs(own - middle) > LIMITS.wheel_apart}
     if 2 * len(apart) > len(usual):  # there are no most wheels
         groups = [{w: own for w, own in apart.items() if (own > middle) is more} for more in (True, False)]
         slips = [f"{' and '.join(group)} by {np.mean(list(group.values())):.2f}" for group in groups if group]
-        text = (
-            f"wheels seem to slip unlike: {', '.join(slips)}: radius, {gear}speed signal or its unit of some of them?"
-        )
-        yield fault(text, *speeds)
+        wrong = f"radius, {gear}speed signal or its unit of some of them?"
+        yield fault(f"wheels seem to slip unlike: {', '.join(slips)}: {wrong}", *speeds)
         return
     for wheel, own in apart.items():
         text = f"seems to slip by {own:.2f}, most wheels by {middle:.2f}: its radius, {gear}speed signal or its unit?"
@@ -293,59 +264,42 @@ def _balance(facts: Facts) -> Iterator[Finding]:
     thrust, asked = facts.thrust.sum(axis=1), pull_given(window, chassis)
     usual = median(thrust)
     if usual < -0.02 * weight:
-        yield fault(
-            f"the wheels brake with {-usual / 1e3:.1f} kN all along while the vehicle drives on: sign of the torques,"
-            " or of the wheel speeds (sign = -1)?",
-            *torques,
-        )
+        what = f"the wheels brake with {-usual / 1e3:.1f} kN all along while the vehicle drives on"
+        yield fault(f"{what}: sign of the torques, or of the wheel speeds (sign = -1)?", *torques)
         return
     if usual > LIMITS.most_thrust * weight:
-        yield fault(
-            f"the wheels thrust with {usual / 1e3:.3g} kN, more than soil can hold under {weight / 1e3:.3g} kN:"
-            " gear_ratio too large, torques measured at the other side of the gear (`at`), or their unit or byte"
-            " order?",
-            *torques,
-        )
+        what = f"{usual / 1e3:.3g} kN, more than soil can hold under {weight / 1e3:.3g} kN"
+        why = f"gear_ratio too large, {OTHER_SIDE} (`at`), or their unit or byte order?"
+        yield fault(f"the wheels thrust with {what}: {why}", *torques)
         return
     rows = changes(facts, thrust, window.draft, asked - window.draft, least=LIMITS.least_seconds)
     if rows is None:
-        raise UndecidableError(
-            "torques and draft are not known together: their signs and the gear ratio cannot be compared"
-        )
+        what = "torques and draft are not known together"
+        raise UndecidableError(f"{what}: their signs and the gear ratio cannot be compared")
     (of_draft, of_inertia), (draft_sd, inertia_sd) = regression(rows[:, 0], rows[:, 1:])
     given, drawn, _ = rows.std(axis=0) > LIMITS.excited * weight
     swings = given and of_draft - LIMITS.side_sd * draft_sd > LIMITS.scale[1]
     if not drawn and not swings:
-        raise UndecidableError(
-            "the draft hardly changes: the signs of draft and torque and the gear ratio cannot be decided"
-        )
+        what = "the signs of draft and torque and the gear ratio"
+        raise UndecidableError(f"the draft hardly changes: {what} cannot be decided")
     if of_draft < -LIMITS.side_sd * draft_sd:
-        yield fault(
-            "signals.draft: falls whenever the wheels thrust more: sign of the draft (positive holds the vehicle back;"
-            " sign = -1)?",
-            "draft",
-        )
+        sign = "sign of the draft (positive holds the vehicle back; sign = -1)?"
+        yield fault(f"signals.draft: falls whenever the wheels thrust more: {sign}", "draft")
     elif of_draft > LIMITS.scale[1] or of_draft + LIMITS.side_sd * draft_sd < LIMITS.scale[0]:
         of_torque = of_inertia > 2.0 * LIMITS.side_sd * inertia_sd and 0.7 < of_draft / of_inertia < 1.4
         gear = f"gear_ratio too {'large' if of_draft > 1.0 else 'small'}"
         in_kgf = "kgf or daN where the DBC says N, " if 6.5 < of_draft < 11.0 else ""
-        why = (
-            f"{gear}, torques measured at the other side of the gear (`at`), or their unit?"
-            if of_torque
-            else f"unit or scale of the draft, {in_kgf}or {gear} (or torques at the other side of the gear)?"
-        )
+        why = f"unit or scale of the draft, {in_kgf}or {gear} (or torques at the other side of the gear)?"
+        if of_torque:
+            why = f"{gear}, {OTHER_SIDE} (`at`), or their unit?"
         text = f"the wheels' thrust changes {of_draft:.2f} times as much as the draft does: {why}"
         yield fault(text, *torques, "draft")
     elif of_inertia < -LIMITS.side_sd * inertia_sd:
         lag = facts.bins(1.0)
         slope, inertia = (change(zero_if_unknown(a), lag).std() for a in (window.pitch, window.acceleration))
         name = "pitch" if GRAVITY * slope > inertia else "acceleration"
-        positive = "nose up" if name == "pitch" else "where the vehicle speeds up"
-        yield fault(
-            f"signals.{name}: asks for less thrust whenever the wheels give more: its sign (positive {positive};"
-            " sign = -1)?",
-            name,
-        )
+        sign = f"its sign (positive {'nose up' if name == 'pitch' else 'where the vehicle speeds up'}; sign = -1)?"
+        yield fault(f"signals.{name}: asks for less thrust whenever the wheels give more: {sign}", name)
 
 
 def _levels(facts: Facts) -> Iterator[Finding]:
@@ -356,13 +310,9 @@ def _levels(facts: Facts) -> Iterator[Finding]:
     thrust = median(facts.thrust.sum(axis=1))
     asked = median(pull_given(window, chassis)[facts.straight & np.isfinite(window.pitch)])
     if asked > LIMITS.rolling * chassis.mass * GRAVITY and thrust < LIMITS.scale[0] * asked:
-        yield fault(
-            f"the wheels thrust with {thrust / 1e3:.2f} kN, but draft, slope and inertia alone ask for"
-            f" {asked / 1e3:.2f} kN: gear_ratio too small, torques measured at the other side of the gear (`at`), or"
-            " unit of torque or draft?",
-            *(f"torque.{w}" for w in rig.wheels),
-            "draft",
-        )
+        what = f"{thrust / 1e3:.2f} kN, but draft, slope and inertia alone ask for {asked / 1e3:.2f} kN"
+        why = f"gear_ratio too small, {OTHER_SIDE} (`at`), or unit of torque or draft?"
+        yield fault(f"the wheels thrust with {what}: {why}", *(f"torque.{w}" for w in rig.wheels), "draft")
 
 
 def _sides(facts: Facts) -> Iterator[Finding]:
@@ -373,12 +323,10 @@ def _sides(facts: Facts) -> Iterator[Finding]:
         torque, more, slip = (of[:, left] - of[:, right] for of in (facts.thrust, load, facts.slip))
         rows = settled(np.stack([torque, more, slip, np.ones(len(slip))], axis=1), facts.bins(0.5), facts.bins(20.0))
         carried = median(load[:, [left, right]].sum(axis=1))
-        if (
-            rows is None
-            or not {f"load.{name}" for name in names} <= facts.mapped  # else what shakes is in torques and slips alone
-            or rows[:, 0].std() < LIMITS.excited * carried  # motors that are given the same torque
-        ):
-            continue
+        if rows is None or not {f"load.{name}" for name in names} <= facts.mapped:
+            continue  # without loads what shakes is in torques and slips alone
+        if rows[:, 0].std() < LIMITS.excited * carried:
+            continue  # motors that are given the same torque
         factors, sd = regression(rows[:, 0], rows[:, 1:])
         of_load, of_slip = (factors < -LIMITS.side_sd * sd)[:2]
         what = "torques" if of_load and of_slip else "loads" if of_load else "speeds"
@@ -411,12 +359,9 @@ def _wheel_based(facts: Facts) -> Iterator[Finding]:
         slip, thrust = (means - means.mean(axis=0)).T
         (per_thrust,), (sd,) = regression(slip, thrust[:, None])
         if thrust.std() > LIMITS.excited and per_thrust + LIMITS.side_sd * sd < CONSISTENCY.slip_per_traction:
-            yield fault(
-                f"signals.ground_speed: goes with the {axle} wheels: hardly any slip comes with their thrust, which"
-                f" moves by {thrust.std() * carried / 1e3:.1f} kN: is it computed from wheels or motor? map a radar's"
-                " or a receiver's speed",
-                "ground_speed",
-            )
+            moves = f"hardly any slip comes with their thrust, which moves by {thrust.std() * carried / 1e3:.1f} kN"
+            why = "is it computed from wheels or motor? map a radar's or a receiver's speed"
+            yield fault(f"signals.ground_speed: goes with the {axle} wheels: {moves}: {why}", "ground_speed")
             return
 
 
@@ -444,18 +389,16 @@ def _accelerometer(facts: Facts) -> Iterator[Finding]:
     rows = _felt(facts)
     if rows is None:
         return
-    for factors, sds, power in (
-        (*regression(rows[:, 0], rows[:, 1:]), 1.0),
-        (*regression(rows[:, 1], rows[:, [0, 2]]), -1.0),
-    ):
+    for of, on, power in ((0, (1, 2), 1.0), (1, (0, 2), -1.0)):
+        factors, sds = regression(rows[:, of], rows[:, on])
         if factors[0] - LIMITS.side_sd * sds[0] > LIMITS.scale[1]:
             size = f"{factors[0] ** power:.2g} times as much as the ground speed asks"
             yield fault(f"signals.acceleration: changes {size}: its unit or scale?", "acceleration")
             return
-    felt, sensor = _slope_felt(rows), facts.config.signals.acceleration
-    if "pitch" not in facts.mapped or sensor is None or felt is None:
+    felt = _slope_felt(rows)
+    if "pitch" not in facts.mapped or felt is None:
         return
-    (share, margin), is_force = felt, sensor.kind == "specific_force"
+    (share, margin), is_force = felt, facts.rig.specific_force
     if share < -margin:
         text = "signals.pitch: the accelerometer feels it the other way: its sign (positive nose up; sign = -1)?"
         yield fault(text, "pitch")
@@ -479,14 +422,11 @@ def _slope(facts: Facts) -> Iterator[Finding]:
     uphill = weight * np.sin(window.pitch)
     x = changes(facts, facts.thrust.sum(axis=1), uphill, pull_given(window, chassis) - uphill)
     if x is None or x[:, 1].std() < LIMITS.excited * weight:
-        rows = _felt(facts)
-        if rows is not None and _slope_felt(rows):
+        if (rows := _felt(facts)) is not None and _slope_felt(rows):
             return  # the accelerometer says it
         kind = " and the kind of signals.acceleration" if "acceleration" in facts.mapped else ""
-        raise UndecidableError(
-            f"the slope hardly changes: the sign and scale of signals.pitch{kind} cannot be decided: drive up and down"
-            " a slope"
-        )
+        what = f"the sign and scale of signals.pitch{kind}"
+        raise UndecidableError(f"the slope hardly changes: {what} cannot be decided: drive up and down a slope")
     (of_slope, _), (sd, _) = regression(x[:, 0], x[:, 1:])
     if of_slope < -LIMITS.side_sd * sd:
         text = "signals.pitch: the wheels thrust less uphill: its sign (positive nose up; sign = -1)?"
@@ -504,18 +444,15 @@ def _yaw(facts: Facts) -> Iterator[Finding]:
         raise UndecidableError("left and right wheels cannot be told apart: map signals.yaw_rate and drive curves")
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
         return
-    left, right = pairs(rig)
-    rims = rig.radius * window.speed
-    sides = np.sign(rims[:, right] - rims[:, left])
+    left, right = (rig.radius * window.speed).T[pairs(rig)]
+    sides = np.sign(right - left).T
     turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(sides.sum(axis=1)) == sides.shape[1])
     if turns.sum() < facts.bins(2.0):
         raise UndecidableError("no turns: the sign of the yaw rate, and which wheels are left, cannot be decided")
     if median((sides[:, 0] * np.sign(window.yaw_rate))[turns]) < 0.0:
-        yield fault(
-            "signals.yaw_rate: to the left while the left wheels go faster: its sign (positive to the left), or left"
-            " and right wheels swapped (the left wheel of an axle comes first)?",
-            "yaw_rate",
-        )
+        why = "left and right wheels swapped (the left wheel of an axle comes first)?"
+        text = f"to the left while the left wheels go faster: its sign (positive to the left), or {why}"
+        yield fault(f"signals.yaw_rate: {text}", "yaw_rate")
 
 
 def _radius_open(facts: Facts) -> Iterator[Finding]:
@@ -525,20 +462,17 @@ def _radius_open(facts: Facts) -> Iterator[Finding]:
         return
     forces = facts.thrust.sum(axis=1), pull_given(facts.window, chassis)
     idle = np.max(np.abs(forces), axis=0) < LIMITS.rolling * chassis.mass * GRAVITY
-    slips = [(wheel, median(facts.slip[idle, i])) for i, wheel in enumerate(facts.rig.wheels)]
     if idle.sum() > facts.bins(LIMITS.least_seconds):
-        for wheel, slip in slips:
-            if abs(slip) > LIMITS.idle_slip:
+        for i, wheel in enumerate(facts.rig.wheels):
+            if abs(slip := median(facts.slip[idle, i])) > LIMITS.idle_slip:
                 yield Finding(f"wheel.{wheel}: slips by {slip:.2f} where nothing is pulled: its radius?", False)
         return
     free = [w.name for w in facts.config.wheel if not w.driven and w.name in facts.rig.wheels]
     usual = {wheel: median(facts.slip[:, facts.rig.wheels.index(wheel)]) for wheel in free}
     rims = ", ".join(f"{wheel} {1.0 / (1.0 - own):.3f}" for wheel, own in usual.items())
     over = f" (rim over ground speed of free wheels: {rims})" if rims else ""
-    raise UndecidableError(
-        f"radius and slip cannot be told apart, 5 % of radius is 0.05 of slip{over}: roll a minute without draft on"
-        " firm ground"
-    )
+    what = f"radius and slip cannot be told apart, 5 % of radius is 0.05 of slip{over}"
+    raise UndecidableError(f"{what}: roll a minute without draft on firm ground")
 
 
 CHECKS = (

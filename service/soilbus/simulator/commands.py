@@ -36,10 +36,8 @@ class Commands:
         database = Database()
         database.add_dbc_file(str(shipped_dbc("tractor.dbc")))
         self._messages = {m.frame_id: m for m in map(database.get_message_by_name, (_DRIVE, _TORQUE_LIMIT))}
-        self._codes = {
-            i: {s.name: ValueCodes(s) for s in m.signals if s.name not in (COUNTER, CHECKSUM)}
-            for i, m in self._messages.items()
-        }
+        commanded = {i: [s for s in m.signals if s.name not in (COUNTER, CHECKSUM)] for i, m in self._messages.items()}
+        self._codes = {i: {s.name: ValueCodes(s) for s in signals} for i, signals in commanded.items()}
         self._counter: dict[int, int] = {}
         self._values: dict[str, tuple[float, dict[str, float]]] = {}
 
@@ -65,16 +63,9 @@ class Commands:
     def at(self, now: float) -> Command:
         """Return the commands in force at a time [s]."""
         drive, limits = (self._fresh(name, now) for name in (_DRIVE, _TORQUE_LIMIT))
-        signals = ("LimitFL", "LimitFR", "LimitRL", "LimitRR")
-        return Command(
-            drive.get("Draft"),
-            drive.get("Speed"),
-            {
-                wheel.name: limits[signal] * wheel.gear_ratio
-                for wheel, signal in zip(self._wheels, signals, strict=False)
-                if signal in limits
-            },
-        )
+        of_wheels = zip(self._wheels, ("LimitFL", "LimitFR", "LimitRL", "LimitRR"), strict=False)
+        torque_limit = {wheel.name: limits[name] * wheel.gear_ratio for wheel, name in of_wheels if name in limits}
+        return Command(drive.get("Draft"), drive.get("Speed"), torque_limit)
 
     def _fresh(self, name: str, now: float) -> dict[str, float]:
         came, values = self._values.get(name, (-math.inf, {}))

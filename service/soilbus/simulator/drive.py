@@ -68,23 +68,12 @@ class SimulationError(WorkError):
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """True values of a drive.
+    """True values of a drive, with the effects that acted, what these may depend on (N, W), and mass and geometry.
 
-    Attributes
-    ----------
-    columns
-        By name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track), latitude,
-        longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
-        entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of
-        its own motor; nan: unknown).
-    bogged_at
-        Time [s] at which no slip lets the tractor go on and the drive ends; None without.
-    effects
-        Effects that acted.
-    surroundings
-        What these may depend on (N, W).
-    chassis
-        Mass and geometry as they were.
+    columns by name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track),
+    latitude, longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
+    entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of its
+    own motor; nan: unknown).  bogged_at [s]: when no slip lets the tractor go on and the drive ends; None without.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -151,16 +140,8 @@ class _Place:
 def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
     """Drive the configured vehicle through one realisation of a scenario, which the seed picks.
 
-    Effects are those of config.model.effects and `effects`.
-
-    Raises
-    ------
-    SimulationError
-        There is no vehicle, it cannot even start, or it shall tow what it never tows.
-    KeyError
-        A soil is unknown.
-    ConfigError
-        An effect cannot be.
+    Effects are those of config.model.effects and `effects`. SimulationError where there is no vehicle, it cannot even
+    start, or shall tow what it never tows; KeyError for an unknown soil; ConfigError for an effect that cannot be.
     """
     step = math.inf if scenario.lifted else STEP
     return joined(list(steps(config, scenario, seed, effects, step)))
@@ -207,11 +188,8 @@ def joined(drives: Sequence[Drive]) -> Drive:
 def latest(done: Drive, n: int) -> Drive:
     """Return the last n instants of a drive."""
     around: Any = done.surroundings
-    return replace(
-        done,
-        columns={name: column[-n:] for name, column in done.columns.items()},
-        surroundings=Surroundings(*(a[-n:] if np.ndim(a) > 1 else a for a in around)),
-    )
+    columns = {name: column[-n:] for name, column in done.columns.items()}
+    return replace(done, columns=columns, surroundings=Surroundings(*(a[-n:] if np.ndim(a) > 1 else a for a in around)))
 
 
 def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, ...]) -> _Plan:
@@ -236,17 +214,17 @@ def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, 
 
 def _driven(plan: _Plan, part: slice, place: _Place, command: Command) -> tuple[Drive, _Place]:
     """One step, and where the next one begins."""
-    draft = None if plan.mechanics.climbs else command.draft
-    lifted = draft is None and plan.scenario.lifted
     wanted = None if command.speed is None else max(command.speed, LEAST_SPEED)
+    command = replace(command, draft=None if plan.mechanics.climbs else command.draft, speed=wanted)
+    lifted = command.draft is None and plan.scenario.lifted
     motion, end = _motion(plan, part, place, wanted, math.inf)
-    situation = _situation(plan, part, motion, draft, lifted, wanted, command.torque_limit)
+    situation = _situation(plan, part, motion, command, lifted)
     result = solve(situation, plan.mechanics, place.last)
     lacking = 0.0 if lifted else float(np.mean(situation.demand - result.draft))
     if lacking > 1e-6 * plan.chassis.mass * GRAVITY:
         possible = float(motion.acceleration.mean()) - lacking / plan.chassis.mass
         motion, end = _motion(plan, part, place, wanted, possible)
-        situation = _situation(plan, part, motion, draft, lifted, wanted, command.torque_limit)
+        situation = _situation(plan, part, motion, command, lifted)
         result = solve(situation, plan.mechanics, result)
     lost = ~result.found if lifted else ~result.found | (situation.slip_limit >= MAX_SLIP)
     stuck = np.flatnonzero(lost)
@@ -363,25 +341,12 @@ def _roll(config: Config, side: Array) -> Array:
     return np.asarray(-np.arcsin(side * config.vehicle.track / (2.0 * config.vehicle.cg_height)))
 
 
-def _situation(
-    plan: _Plan,
-    part: slice,
-    motion: _Motion,
-    draft: float | None,
-    lifted: bool,
-    wanted: float | None,
-    torque_limit: Mapping[str, float],
-) -> Situation:
-    """What is given in a step, with the forces of effects that resist.
-
-    Draft [N] and wanted speed [m/s] are None as the scenario has them; with `lifted` the driver lifts the implement at
-    his slip limit.
-    """
+def _situation(plan: _Plan, part: slice, motion: _Motion, command: Command, lifted: bool) -> Situation:
+    """What is given in a step, with the forces of effects that resist; `lifted`: the driver lifts at his slip limit."""
     chassis, wheels, drivetrain = plan.chassis, plan.config.wheel, plan.mechanics.drivetrain
     climbs, side = plan.mechanics.climbs, plan.side[part]
     shape = (len(wheels), len(motion.t))
     share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))]) * (1.0 + plan.bounce[:, part])
-
     ahead = _ahead(plan.config)
 
     def loads(draft: float, inertia: float = 0.0) -> Array:
@@ -395,36 +360,24 @@ def _situation(
     position = motion.distance + to_cg[:, None]
     soil = soil_along(plan.scenario.soils, position, plan.scenario.transition)
 
-    def each_wheel(values: list[float]) -> Array:
-        return np.broadcast_to(np.array(values)[:, None], shape)
+    def each_wheel(name: str) -> Array:
+        return np.broadcast_to(np.array([getattr(wheel, name) for wheel in wheels])[:, None], shape)
 
     demand, slip_limit, least = plan.demand[part], plan.slip_limit[part], plan.least_draft[part]
     if not lifted:
-        rim = RIM_SPEED_RATIO * np.maximum(plan.speed.value[part] if wanted is None else wanted, motion.speed)
-        demand = demand if draft is None else np.full(shape[1], draft)
+        wanted = plan.speed.value[part] if command.speed is None else command.speed
+        rim = RIM_SPEED_RATIO * np.maximum(wanted, motion.speed)
+        demand = demand if command.draft is None else np.full(shape[1], command.draft)
         slip_limit, least = np.minimum(1.0 - motion.speed / rim, MAX_SLIP), np.full(shape[1], -np.inf)
     limit = drivetrain.limit.copy()
     for i, wheel in enumerate(wheels):
-        limit[i] = min(limit[i], torque_limit.get(wheel.name, math.inf))
+        limit[i] = min(limit[i], command.torque_limit.get(wheel.name, math.inf))
     given = Situation(
-        motion.t,
-        motion.distance,
-        motion.speed,
-        motion.acceleration,
-        pull_required(chassis, 0.0, motion.pitch, motion.acceleration),
-        level,
-        (drawn - level) / test_draft,
-        upright,
-        plan.deviation[:, part],
-        each_wheel([wheel.radius for wheel in wheels]),
-        each_wheel([wheel.width for wheel in wheels]),
-        each_wheel([wheel.contact_length for wheel in wheels]),
-        np.array(soil),
-        demand,
-        slip_limit,
-        np.broadcast_to(limit[:, None], (len(limit), len(motion.t))),
-        least,
-    )
+        motion.t, motion.distance, motion.speed, motion.acceleration,
+        pull_required(chassis, 0.0, motion.pitch, motion.acceleration), level, (drawn - level) / test_draft, upright,
+        plan.deviation[:, part], each_wheel("radius"), each_wheel("width"), each_wheel("contact_length"),
+        np.array(soil), demand, slip_limit, np.broadcast_to(limit[:, None], (len(limit), len(motion.t))), least,
+    )  # fmt: skip
     return _with_resisting_effects(given, plan.mechanics)
 
 
@@ -454,29 +407,18 @@ def _columns(
 ) -> dict[str, NDArray[Any]]:
     latitude, longitude = positions(scenario.course, motion.distance)
     columns: dict[str, NDArray[Any]] = {
-        "t": motion.t,
-        "distance": motion.distance,
-        "ground_speed": motion.speed,
-        "acceleration": motion.acceleration,
-        "pitch": motion.pitch,
-        "latitude": latitude,
-        "longitude": longitude,
-        "draft": result.draft,
+        "t": motion.t, "distance": motion.distance, "ground_speed": motion.speed, "acceleration": motion.acceleration,
+        "pitch": motion.pitch, "latitude": latitude, "longitude": longitude, "draft": result.draft,
         "demand": np.where(np.isfinite(situation.demand), situation.demand, np.nan),
         "soil": np.array(soil_names(scenario.soils, motion.distance)),
-    }
+    }  # fmt: skip
     slip, load = wheel_slips(situation, result), situation.load(result.draft)
     limit = np.where(np.isfinite(situation.torque_limit), situation.torque_limit, np.nan)
     for i, wheel in enumerate(wheels):
         of_wheel = {
-            "slip": slip[i],
-            "entry_angle": result.entry_angle[i],
-            "sinkage": sunk[i],
-            "load": load[i],
-            "drawbar_pull": result.forces[1, i],
-            "torque": result.forces[2, i],
-            "speed": motion.speed / (wheel.radius * (1.0 - slip[i])),
-            "torque_limit": limit[i],
-        }
+            "slip": slip[i], "entry_angle": result.entry_angle[i], "sinkage": sunk[i], "load": load[i],
+            "drawbar_pull": result.forces[1, i], "torque": result.forces[2, i],
+            "speed": motion.speed / (wheel.radius * (1.0 - slip[i])), "torque_limit": limit[i],
+        }  # fmt: skip
         columns |= {f"{quantity}.{wheel.name}": column for quantity, column in of_wheel.items()}
     return columns

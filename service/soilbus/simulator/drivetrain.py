@@ -36,21 +36,11 @@ _OF_DRIVE = {"torque", "torque_limit", "max_torque", "motor_speed", "differentia
 class Drivetrain:
     """Drive line of M wheels: one condition a row, and the torques that are limited.
 
-    Attributes
-    ----------
-    speed
-        (M, M), weights of the rim speeds over the ground speed: of a motor (sum 1), or one side of a coupling less the
-        other; zero for a free wheel.
-    torque
-        (M, M), weights of the torques: one side of a coupling less the other, or a free wheel alone; zero for a motor.
-    bias
-        (M,), of a coupling; 0 in all other rows.
-    is_motor
-        (M,).
-    leader
-        (M,), the wheel whose given deviation from the common slip the wheel shares; -1 for a free wheel.
-    limited, limit
-        (L, M) weights of the torques that have a limit, wheels first, and these limits [N m] (L,); inf for none.
+    speed (M, M): weights of the rim speeds over the ground speed: of a motor (sum 1), or one side of a coupling less
+    the other; zero for a free wheel.  torque (M, M): weights of the torques: one side of a coupling less the other, or
+    a free wheel alone; zero for a motor.  bias (M,): of a coupling, 0 in all other rows; is_motor (M,).  leader (M,):
+    the wheel whose given deviation from the common slip the wheel shares, -1 for a free wheel.  limited (L, M): weights
+    of the torques that have a limit, wheels first; limit (L,): these limits [N m], inf for none.
     """
 
     speed: Array
@@ -73,17 +63,10 @@ def own_motors(limit: Sequence[float] | Array) -> Drivetrain:
 def drivetrain_of(config: Config) -> Drivetrain:
     """Return the drive line that the configuration describes.
 
-    Parameters
-    ----------
-    config
-        An [[axle]] with a torque, a motor's speed, a limit or a differential drives its wheels together, `both` those
-        of both axles; so does one signal of torque or speed that is mapped for several wheels. Every other driven
-        wheel has a motor of its own.
-
-    Returns
-    -------
-    Couplings are those of `differential` of each axle and of `both`, open on an axle and locked between the axles
-    where it is not given. Wheels on one signal of speed turn together.
+    An [[axle]] with a torque, a motor's speed, a limit or a differential drives its wheels together, `both` those of
+    both axles; so does one signal of torque or speed that is mapped for several wheels. Every other driven wheel has a
+    motor of its own. Couplings are those of `differential` of each axle and of `both`, open on an axle and locked
+    between the axles where it is not given. Wheels on one signal of speed turn together.
     """
     wheels = config.wheel
     n = len(wheels)
@@ -105,16 +88,9 @@ def drivetrain_of(config: Config) -> Drivetrain:
             for side, sign in ((one, 1.0), (other, -1.0)):
                 speed[row, side] = sign * per_turn[side] / len(side) / per_turn[group].mean()
                 torque[row, side] = sign / ratio[side] * ratio[group].mean()
-    limited, limit = _limits_of_axles(config, ratio)
-    return Drivetrain(
-        speed,
-        torque,
-        bias,
-        is_motor,
-        leader,
-        np.concatenate([np.eye(n), limited]),
-        np.concatenate([drive.limit, limit]),
-    )
+    weights, limits = _limits_of_axles(config, ratio)
+    limited, limit = np.concatenate([np.eye(n), weights]), np.concatenate([drive.limit, limits])
+    return Drivetrain(speed, torque, bias, is_motor, leader, limited, limit)
 
 
 def _groups(config: Config) -> list[list[int]]:
@@ -150,9 +126,7 @@ def _couplings(config: Config, group: Sequence[int]) -> Iterator[tuple[list[int]
 def _bias(axle: Axle | None, otherwise: str) -> float:
     """Greatest difference of the torques over their sum."""
     kind = otherwise if axle is None else axle.differential
-    if kind == "locked" or axle is None or axle.torque_bias is None:
-        return BIAS[kind]
-    return axle.torque_bias
+    return BIAS[kind] if kind == "locked" or axle is None or axle.torque_bias is None else axle.torque_bias
 
 
 def _limits_of_axles(config: Config, ratio: Array) -> tuple[Array, Array]:

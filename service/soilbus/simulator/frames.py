@@ -49,13 +49,7 @@ def frames(
     """Yield the recording's frames in the order of their stamps, the first instant at `start` [s].
 
     Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
-
-    Raises
-    ------
-    ConfigError
-        As `channels_of`.
-    ValueError
-        A mapped message cannot be encoded.
+    ConfigError as `channels_of`, ValueError where a mapped message cannot be encoded.
     """
     encoder = Encoder(config, recording.seed, database, start)
     yield from encoder.frames(recording.channels, recording.truth)
@@ -67,10 +61,8 @@ class Encoder:
     def __init__(self, config: Config, seed: int, database: Database | None = None, start: float = START_TIME) -> None:
         database = database if database is not None else load_databases(config)
         self._config, self._start = config, start
-        self._messages = [
-            (database.get_message_by_name(name), channels, channel_rng(seed, name))
-            for name, channels in grouped(channels_of(config, database), lambda channel: channel.message).items()
-        ]
+        mapped = grouped(channels_of(config, database), lambda channel: channel.message).items()
+        self._messages = [(database.get_message_by_name(name), of, channel_rng(seed, name)) for name, of in mapped]
         self._sent: Counter[str] = Counter()
         self._last: dict[str, Column] = {}
 
@@ -97,9 +89,7 @@ class Encoder:
 
 def _after(last: Column | None, column: Column) -> Column:
     """A column with the sample before it, which slower channels hold."""
-    if last is None:
-        return column
-    return Column(np.append(last.t, column.t), np.append(last.value, column.value))
+    return column if last is None else Column(np.append(last.t, column.t), np.append(last.value, column.value))
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:
@@ -148,10 +138,7 @@ def _unmapped_signals(
     mapped = {channel.signal for channel in channels}
     gears = {wheel.name: wheel.gear_ratio for wheel in config.wheel} | {a.name: a.gear_ratio for a in config.axle}
     motor = next((c.wheel for c in channels if c.quantity == "torque"), None)
-    known = {
-        "GroundBasedMachineDistance": truth["distance"],
-        "GroundBasedMachineDirection": np.ones_like(truth["t"]),
-    }
+    known = {"GroundBasedMachineDistance": truth["distance"], "GroundBasedMachineDirection": np.ones_like(truth["t"])}
     if motor is not None:
         known["ShaftSpeed"] = true_speed(truth, config, motor) * gears[motor] * 30.0 / math.pi
     names = {signal.name for signal in message.signals} - mapped
@@ -161,10 +148,7 @@ def _unmapped_signals(
 def _raw_codes(
     message: Message, channels: list[Channel], values: Mapping[str, Array], n_frames: int, sent: int
 ) -> dict[str, NDArray[np.int64]]:
-    codes: dict[str, NDArray[np.int64]] = {}
-    for signal in message.signals:
-        if signal.name in values:
-            codes[signal.name] = ValueCodes(signal).column(values[signal.name])
+    codes = {s.name: ValueCodes(s).column(values[s.name]) for s in message.signals if s.name in values}
     for channel in channels:
         if channel.valid_signal is not None and channel.valid_values:
             codes[channel.valid_signal] = np.full(n_frames, channel.valid_values[0])

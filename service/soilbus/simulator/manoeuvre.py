@@ -19,17 +19,11 @@ __all__ = ["LARGEST", "Manoeuvre", "of_json"]
 
 COLUMNS = ("slip", "speed", "side_load", "slope")
 """What a manoeuvre prescribes at its times."""
-GAP = 1.0
-"""Time [s] from the end of a manoeuvre to its start again."""
 LARGEST = 1 << 22
 """Bytes of a file that may be a manoeuvre."""
 RANGES = {
-    "t": (0.0, 86_400.0),
-    "slip": (-1.0, 1.0),
-    "speed": (0.05, 20.0),
-    "side_load": (-1.0, 1.0),
-    "slope": (-0.6, 0.6),
-}
+    "t": (0.0, 86_400.0), "slip": (-1.0, 1.0), "speed": (0.05, 20.0), "side_load": (-1.0, 1.0), "slope": (-0.6, 0.6),
+}  # fmt: skip
 """What a table from a file may hold: a day, what slip and a moved share of a load are, slopes that `--slope` takes."""
 
 
@@ -52,11 +46,6 @@ class Manoeuvre:
     def duration(self) -> float:
         """Duration [s]."""
         return self.t[-1]
-
-    def repeated(self, times: int) -> Manoeuvre:
-        """Return the manoeuvre several times in a row."""
-        t = tuple(round(i * (self.duration + GAP) + at, 6) for i in range(times) for at in self.t)
-        return replace(self, t=t, **{name: getattr(self, name) * times for name in COLUMNS})
 
     def over(self, scenario: Scenario, nothing_towed: bool = False) -> Scenario:
         """Return a scenario in which the manoeuvre is driven on the ground of another."""

@@ -52,11 +52,9 @@ def scenario_over(
 
 def send_in_time(messages: Iterable[can.Message], send: Callable[[can.Message], None]) -> None:
     """Send messages, in the order of their stamps, spaced as these are."""
-    first: float | None = None
-    begin = time.monotonic()
+    first, begin = math.nan, time.monotonic()
     for message in messages:
-        if first is None:
-            first = message.timestamp
+        first = message.timestamp if math.isnan(first) else first
         ahead = message.timestamp - first - (time.monotonic() - begin)
         if ahead > 0.0005:
             time.sleep(ahead)

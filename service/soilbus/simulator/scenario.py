@@ -19,19 +19,9 @@ from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 
 __all__ = [
-    "SAMPLE_RATE",
-    "Patch",
-    "Profile",
-    "Scenario",
-    "Swing",
-    "Wave",
-    "demo",
-    "excited",
-    "oscillation",
-    "realise",
-    "soil_along",
-    "soil_names",
-]
+    "SAMPLE_RATE", "Patch", "Profile", "Scenario", "Swing", "Wave", "demo", "excited", "oscillation", "realise",
+    "soil_along", "soil_names",
+]  # fmt: skip
 
 SAMPLE_RATE = 50.0
 """Samples of the true values a second [Hz]."""

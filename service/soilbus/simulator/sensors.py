@@ -11,7 +11,7 @@ for a drive from config [noise]. Quantisation comes with the frames (simulator/f
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,21 +63,14 @@ class Sensor(NamedTuple):
 
 def sensors(config: Config) -> Iterator[Sensor]:
     """Yield every sensor that the configuration maps, in the order of its channels."""
-    seen: set[tuple[str, str]] = set()
     for wheel in config.wheel:
         for quantity in WHEEL_ROLES:
             mapped = getattr(wheel, quantity)
-            shared = quantity in SHARED_ROLES
-            if mapped is not None and not (shared and (quantity, mapped.signal) in seen):
-                seen.add((quantity, mapped.signal))
-                same = [
-                    w.name
-                    for w in config.wheel
-                    if getattr(w, quantity) and getattr(w, quantity).signal == mapped.signal
-                ]
-                yield Sensor(
-                    quantity, wheel.name, mapped, dict.fromkeys(same, 1.0 / len(same)) if shared else {wheel.name: 1.0}
-                )
+            same = [wheel.name]
+            if mapped is not None and quantity in SHARED_ROLES:
+                same = next([w.name for w in of] for of in config.same_signal(quantity) if wheel in of)
+            if mapped is not None and same[0] == wheel.name:
+                yield Sensor(quantity, wheel.name, mapped, dict.fromkeys(same, 1.0 / len(same)))
     for axle in config.axle:
         for role, quantity in AXLE_ROLES.items():
             if (mapped := getattr(axle, role)) is not None:
@@ -101,12 +94,6 @@ def _of_axle(config: Config, axle: Axle, quantity: str) -> dict[str, float]:
     if quantity == "speed":
         return {wheel.name: turns(wheel) / len(wheels) for wheel in wheels}
     return {wheel.name: 1.0 if quantity == "load" else 1.0 / turns(wheel) for wheel in wheels}
-
-
-def fitted(config: Config) -> Iterator[tuple[str, str]]:
-    """Yield (quantity, wheel, axle or "") of every channel that the configuration maps."""
-    for sensor in sensors(config):
-        yield sensor.quantity, sensor.part
 
 
 def measure(drive: Drive, config: Config, seed: int, vehicle_seed: int | None = None) -> dict[str, Column]:
@@ -161,7 +148,7 @@ class Instruments:
         if quantity == "torque_limit" and sensor.part in self._limits:
             truth = np.full_like(t, self._limits[sensor.part])
         else:
-            truth = _true_reading(true_columns, _MEASURED_QUANTITY.get(quantity, quantity), sensor.weight)
+            truth = true_reading(true_columns, quantity, sensor.weight)
         if sensor.mapped.delay != 0.0:
             truth = np.interp(t - sensor.mapped.delay, t, truth)
         if quantity in _NOISELESS:
@@ -169,8 +156,7 @@ class Instruments:
         if quantity in POSITION_ROLES:
             parallel = 1.0 if quantity == "latitude" else np.cos(true_columns["latitude"][new])
             return wrapped(truth[new] + POSITION_SD / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(n))
-        noise, window = _noise_of(self._config, sensor), self._config.estimator.window
-        sd = noise_sd(truth, noise, window)[new]
+        sd = noise_sd(truth, _noise_of(self._config, sensor), self._config.estimator.window)[new]
         return np.asarray((1.0 + self._gain[sensor.name]) * truth[new] + sd * rng.standard_normal(n))
 
 
@@ -183,22 +169,11 @@ def true_speed(true_columns: Mapping[str, NDArray[Any]], config: Config, part: s
     """Return the rotation [rad/s] (N,) of a wheel, or the mean of an axle's wheels."""
     axle = next((axle for axle in config.axle if axle.name == part), None)
     weight = {part: 1.0} if axle is None else _of_axle(config, axle, "speed")
-    return _true_reading(true_columns, "speed", weight)
+    return true_reading(true_columns, "speed", weight)
 
 
-def true_readings(true_columns: Mapping[str, NDArray[Any]], config: Config, names: Iterable[str]) -> dict[str, Array]:
-    """Return what the sensors of these channels read without errors and effects (N,)."""
-    columns = dict(true_columns) | _straight_on(true_columns, config)
-    of_channel = {sensor.name: sensor for sensor in sensors(config)}
-    quantity = {name: of_channel[name].quantity for name in names}
-    return {
-        name: _true_reading(columns, _MEASURED_QUANTITY.get(of, of), of_channel[name].weight)
-        for name, of in quantity.items()
-    }
-
-
-def _straight_on(true_columns: Mapping[str, NDArray[Any]], config: Config) -> dict[str, NDArray[Any]]:
-    """Acceleration (N,) as its sensor feels it, and what is zero on a straight way."""
+def straight_on(true_columns: Mapping[str, NDArray[Any]], config: Config) -> dict[str, NDArray[Any]]:
+    """Return the acceleration (N,) as its sensor feels it, and what is zero on a straight way."""
     felt = dict.fromkeys(("yaw_rate", "steering_angle", LOCK), np.zeros(len(true_columns["t"])))
     mapped = config.signals.acceleration
     if mapped is not None and mapped.kind == "specific_force":
@@ -206,8 +181,9 @@ def _straight_on(true_columns: Mapping[str, NDArray[Any]], config: Config) -> di
     return felt
 
 
-def _true_reading(true_columns: Mapping[str, NDArray[Any]], quantity: str, weight: Mapping[str, float]) -> Array:
-    """What a sensor without errors reads (N,)."""
+def true_reading(true_columns: Mapping[str, NDArray[Any]], quantity: str, weight: Mapping[str, float]) -> Array:
+    """Return what a sensor without errors reads (N,) of a quantity, by the weights of the wheels, if any."""
+    quantity = _MEASURED_QUANTITY.get(quantity, quantity)
     if not weight:
         return np.asarray(true_columns[quantity])
     first, *others = (share * true_columns[f"{quantity}.{wheel}"] for wheel, share in weight.items())
@@ -226,7 +202,7 @@ def _with_sensor_effects(drive: Drive, config: Config) -> dict[str, NDArray[Any]
             load = load + effect.load(around, values)
         if effect.draft is not None:
             draft = draft + np.ravel(effect.draft(drive.columns["draft"], around, values))
-    changed = {"draft": draft} | _straight_on(drive.columns, config)
+    changed = {"draft": draft} | straight_on(drive.columns, config)
     for i, wheel in enumerate(wheels):
         changed |= {f"torque.{wheel}": torque[:, i], f"load.{wheel}": load[:, i]}
     return changed | _late(drive, drive.columns | changed, wheels)
@@ -237,9 +213,8 @@ def _late(drive: Drive, true_columns: dict[str, NDArray[Any]], wheels: list[str]
     changed: dict[str, NDArray[Any]] = {}
     for effect, values in drive.effects:
         for quantity, late in effect.late.items():
-            names = (
-                [f"{quantity}.{wheel}" for wheel in wheels] if f"{quantity}.{wheels[0]}" in true_columns else [quantity]
-            )
+            of_wheels = [f"{quantity}.{wheel}" for wheel in wheels]
+            names = of_wheels if of_wheels[0] in true_columns else [quantity]
             columns = np.stack([changed.get(name, true_columns[name]) for name in names], axis=1)
             changed |= dict(zip(names, read_late(columns, true_columns["t"], values, late).T, strict=True))
     return changed

@@ -20,26 +20,12 @@ __all__ = ["write_truth"]
 
 
 def write_truth(done: Drive, path: Path, start: float) -> None:
-    """Write the true values of a drive.
+    """Write the true values of a drive as Parquet to a .parquet file, else as CSV; NotWritten where that cannot be.
 
-    Parameters
-    ----------
-    done
-        The drive.
-    path
-        Of a .parquet file, or of a CSV file under any other name.
-    start
-        Stamp of the first instant [s].
-
-    Raises
-    ------
-    NotWritten
-        The table cannot be written.
+    `start` is the stamp of the first instant [s].
     """
-    columns: dict[str, NDArray[Any]] = done.columns | {"t": start + done.columns["t"]}
-    columns = {
-        name: column for name, column in columns.items() if column.dtype.kind != "f" or np.isfinite(column).any()
-    }
+    whole = done.columns | {"t": start + done.columns["t"]}
+    columns = {name: of for name, of in whole.items() if of.dtype.kind != "f" or np.isfinite(of).any()}
     if path.suffix == ".parquet":
         arrow: Any = import_module("pyarrow")  # typed only in part
         with whole_file_of_bytes(path) as binary:

@@ -83,10 +83,6 @@ class Dual(NDArrayOperatorsMixin):
         """Return the sum over axes, as numpy does."""
         return self._each(lambda a: a.sum(axis=axis))
 
-    def only(self, kind: type) -> Dual:
-        """Return the number without derivatives by quantities that are not of this type."""
-        return Dual(self.value, {q: d for q, d in self.by.items() if isinstance(q, kind)})
-
     def _each(self, linear: Any) -> Dual:
         shape = self.shape
         return Dual(linear(self.value), {q: linear(np.broadcast_to(d, shape)) for q, d in self.by.items()})

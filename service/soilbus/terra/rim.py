@@ -61,10 +61,8 @@ def gauss(nodes: int, power: int) -> tuple[Array, Array]:
 
 def on_branches(x: Array, w: Array, peak: Any, leave: Any) -> tuple[Array, Array]:
     """Return the nodes as shares of the entry angle and weights (2, M, ...) from x and weights on 0..1 (M, ...)."""
-    peak = peak + np.zeros_like(leave)
-    return np.stack([1.0 - (1.0 - peak) * x, leave + (peak - leave) * x]), np.stack(
-        [(1.0 - peak) * w, (peak - leave) * w]
-    )
+    front, rear = 1.0 - (peak + np.zeros_like(leave)), (peak + np.zeros_like(leave)) - leave
+    return np.stack([1.0 - front * x, leave + rear * x]), np.stack([front * w, rear * w])
 
 
 @cache

@@ -13,14 +13,9 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "SHEAR_LAWS",
-    "ShearLaw",
-    "exponential_shear",
-    "lumped_modulus",
-    "normal_stress",
-    "rational_shear",
+    "SHEAR_LAWS", "ShearLaw", "exponential_shear", "lumped_modulus", "normal_stress", "rational_shear",
     "shear_displacement",
-]
+]  # fmt: skip
 
 ShearLaw = Callable[[Any], tuple[Any, Any]]
 """Shear displacement over K -> mobilised share of the strength, and its derivative."""
@@ -68,8 +63,5 @@ def rational_shear(ratio: Any) -> tuple[Any, Any]:
     return ratio * share, share**2
 
 
-SHEAR_LAWS: dict[str, ShearLaw] = {
-    "exponential": exponential_shear,
-    "rational": rational_shear,
-}
+SHEAR_LAWS: dict[str, ShearLaw] = {"exponential": exponential_shear, "rational": rational_shear}
 """Shear laws by the name that the configuration has for them."""

@@ -169,18 +169,12 @@ def _pressed(state: WheelState, model: WheelModel) -> _Pressed:
     below, to_below, below_by_n, to_below_by_n = _power(deep, n)
     over, over_integral = below - at_pan, to_below - to_pan - at_pan * (deep - d)
     sill = np.where(z > d, n * d ** (n - 1.0) if d else 0.0, 0.0)
-    return _Pressed(
-        pressure + k * over,
-        integral + k * over_integral,
-        ((steep + k * np.where(z > d, n * deep ** (n - 1.0), 0.0)) * by_angle, (pressure + k * over) * by_angle),
-        (
-            pressure_by_n + k * (below_by_n - at_pan_by_n),
-            integral_by_n + k * (to_below_by_n - to_pan_by_n - at_pan_by_n * (deep - d)),
-        ),
-        over,
-        over_integral,
-        (-k * sill, -k * sill * (deep - d)),
-    )
+    steeper = steep + k * np.where(z > d, n * deep ** (n - 1.0), 0.0)
+    whole, whole_integral = pressure + k * over, integral + k * over_integral
+    by_n = pressure_by_n + k * (below_by_n - at_pan_by_n)
+    integral_of_n = integral_by_n + k * (to_below_by_n - to_pan_by_n - at_pan_by_n * (deep - d))
+    of_angle, of_depth = (steeper * by_angle, whole * by_angle), (-k * sill, -k * sill * (deep - d))
+    return _Pressed(whole, whole_integral, of_angle, (by_n, integral_of_n), over, over_integral, of_depth)
 
 
 class _Mobilised(NamedTuple):

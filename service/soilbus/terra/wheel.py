@@ -31,36 +31,19 @@ from soilbus.terra.contact_stress import (
 )
 from soilbus.terra.hardpan import by_pan, pan_stresses, reaching
 from soilbus.terra.soil_laws import lumped_modulus
-from soilbus.terra.track import (
-    track_forces,
-    track_forces_and_jacobian,
-    track_forces_and_slopes,
-    track_load_and_slope,
-)
+from soilbus.terra.track import track_forces, track_forces_and_jacobian, track_forces_and_slopes, track_load_and_slope
 from soilbus.terra.wheel_state import EXACT_NODES, FAST_NODES, WheelModel, WheelState
 
 __all__ = [
-    "EXACT_NODES",
-    "FAST_NODES",
-    "FORCES",
-    "INPUTS",
-    "SHAPE",
-    "Soil",
-    "WheelModel",
-    "WheelState",
-    "sinkage",
-    "state_on",
-    "wheel_forces",
-    "wheel_forces_and_derivatives",
-    "wheel_forces_and_slopes",
-]
+    "EXACT_NODES", "FAST_NODES", "FORCES", "INPUTS", "SHAPE", "Soil", "WheelModel", "WheelState", "sinkage", "state_on",
+    "wheel_forces", "wheel_forces_and_derivatives", "wheel_forces_and_slopes",
+]  # fmt: skip
 
 MIN_ENTRY_ANGLE = 1e-4
 MAX_ENTRY_ANGLE = 1.4
 _CHUNK = 16384
 """Nodes of a branch that are integrated at once: all fields of this many stay in the processor's cache.  Short
 of it small chunks cost twice as much, given that the allocator keeps its memory (soilbus.allocator)."""
-
 
 FORCES = ("load", "drawbar_pull", "torque")
 """What wheel_forces() returns: W [N], DP [N], T [N m]."""
@@ -240,9 +223,8 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
     np.multiply(at.shear_share, fields[1], out=fields[6])
     np.multiply(mobilising, at.rim.travel, out=fields[7])
     np.multiply(mobilising, at.j_K, out=fields[8])
-    by_normal, deeper, pressed, by_rubbed, by_stuck, turned, rubbed_deeper, by_slip, by_K = integrals(
-        fields, 3, at.rim
-    ).swapaxes(0, 1)
+    parts = integrals(fields, 3, at.rim).swapaxes(0, 1)
+    by_normal, deeper, pressed, by_rubbed, by_stuck, turned, rubbed_deeper, by_slip, by_K = parts
     turned[2] += np.einsum("bmn,bmn->n", at.normal, at.share)
     by_entry, of_slip = _reshaped(at, state, model, tau, mobilising)
     turned += by_entry

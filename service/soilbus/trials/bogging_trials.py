@@ -22,6 +22,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward
+from soilbus.grouping import grouped
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
@@ -74,10 +75,8 @@ class WarningTrial:
     def sudden(self) -> bool:
         """Whether slip passed its limit too soon for any warning to be early enough."""
         speed = self.possible_distance / self.possible if 0.0 < self.possible < np.inf else 0.0
-        return (
-            self.possible < MIN_LEAD_TIME + REACTION_TIME
-            and self.possible_distance < MIN_LEAD_DISTANCE + REACTION_TIME * speed
-        )
+        is_short = self.possible_distance < MIN_LEAD_DISTANCE + REACTION_TIME * speed
+        return self.possible < MIN_LEAD_TIME + REACTION_TIME and is_short
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,10 +121,8 @@ def trial(task: Task) -> WarningTrial:
 def driven(task: Task) -> tuple[Recording, Drive]:
     """Simulate one drive."""
     config, rng = task.config, np.random.default_rng([task.seed, 3])
-    if task.kind in FIRM_KINDS:
-        trouble = BoggingDrive(firm_ground(config, task.kind, rng))
-    else:
-        trouble = bogging(config, task.kind, rng)
+    is_firm = task.kind in FIRM_KINDS
+    trouble = BoggingDrive(firm_ground(config, task.kind, rng)) if is_firm else bogging(config, task.kind, rng)
     recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
     truth, start = recording.truth, config.estimator.window
     t = truth["t"]
@@ -182,16 +179,12 @@ def warning_trials(
     Raises SimulationError where the vehicle cannot be driven.
     """
     firm = math.ceil(3600.0 * hours / (DRIVE_TIME - config.estimator.window))
-    kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
-        HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
-    ]
+    kinds = [KINDS[i % len(KINDS)] for i in range(boggings)]
+    kinds += [HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)]
     seeds = [s // 2 * 2 for s in seeds_of(seed, "warnings", len(kinds))]
     trials = list(each(trial, [Task(config, kind, s) for kind, s in zip(kinds, seeds, strict=True)]))
-    return tuple(
-        figures(kind, found)
-        for kind in (*KINDS, *FIRM_KINDS)
-        if (found := [t for t in trials if t.kind == kind])
-    )  # fmt: skip
+    of_kind = grouped(trials, lambda t: t.kind)
+    return tuple(figures(kind, of_kind[kind]) for kind in (*KINDS, *FIRM_KINDS) if kind in of_kind)
 
 
 def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:

@@ -102,14 +102,9 @@ def largest_draft(config: Config, soil: str, side: float = 0.0) -> float:
 
     side: share of each axle's load that a side slope moves to its left wheel.
     """
-    rig = rig_of(config)
-    no_limit = np.full(len(rig.radius), np.nan)
-    drivetrain = drivetrain_of(config)
-    drivetrain = replace(drivetrain, limit=np.full_like(drivetrain.limit, np.inf))
-    slip = config.traversability.max_slip
-    return true_largest_draft(
-        soil_named(soil), rig, no_limit, slip, WheelModel(), drivetrain=drivetrain, side_shift=side
-    )
+    rig, line, slip = rig_of(config), drivetrain_of(config), config.traversability.max_slip
+    no_limit, line = np.full(len(rig.radius), np.nan), replace(line, limit=np.full_like(line.limit, np.inf))
+    return true_largest_draft(soil_named(soil), rig, no_limit, slip, WheelModel(), drivetrain=line, side_shift=side)
 
 
 def side_shift(config: Config, soil: str, most: float) -> float:
@@ -144,8 +139,7 @@ def _digging(
 ) -> BoggingDrive:
     """Ground that softens, wheels that dig the deeper the more they slip, and a driver who keeps the throttle.
 
-    Ground speed falls as slip grows: the slips of a first drive at constant speed, metre by
-    metre, give the speed of the second.
+    Ground speed falls as slip grows: slips of a first drive at constant speed, metre by metre, give that of the second.
     """
     length, rim = rng.uniform(15.0, 40.0), rng.uniform(1.2, 1.8)
     slip_sinkage = CATALOGUE["slip_sinkage"]

@@ -48,10 +48,8 @@ def _call_section(found: Reliability) -> Iterator[str]:
         for b in found.bins if b.calls
     ]  # fmt: skip
     yield table(head, rows)
-    yield (
-        f"{found.drives} drives, {found.failed} without a call.  Brier score {found.brier:.4f}, "
-        f"{found.brier_expected:.4f} +- {found.brier_std:.4f} if calibrated;"
-    )
+    brier = f"Brier score {found.brier:.4f}, {found.brier_expected:.4f} +- {found.brier_std:.4f} if calibrated;"
+    yield f"{found.drives} drives, {found.failed} without a call.  {brier}"
     yield f"outcomes less probabilities {found.excess:+.1f} standard deviations; go called {found.go} times, wrongly"
     yield f"{found.wrong_go} times, {found.wrong_go_expected:.2f} expected.  * marks a mean outside its interval."
 
@@ -74,14 +72,11 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     yield f"{lost}, slip passes in less than that and {REACTION_TIME:g} s to react."
     yield ""
     firm = [found for found in warnings if found.hours]
-    yield table(
-        ("without a bogging", "hours", "false warnings"), [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in firm]
-    )
-    for name, pooled in _pooled(firm).items():
-        yield (
-            f"{name.capitalize()} drives: {pooled.false} false in {pooled.hours:.2f} h, {pooled.rate:.2f} an hour "
-            f"(95 % interval {pooled.least:.2f} to {pooled.most:.2f})."
-        )
+    false = [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in firm]
+    yield table(("without a bogging", "hours", "false warnings"), false)
+    for name, of in _pooled(firm).items():
+        rate = f"{of.rate:.2f} an hour (95 % interval {of.least:.2f} to {of.most:.2f})"
+        yield f"{name.capitalize()} drives: {of.false} false in {of.hours:.2f} h, {rate}."
     yield "Target: at most one false warning an hour, on hard drives alone too.  All drives have even seeds: thresholds"
     yield "are set by those of odd seeds alone."
 
@@ -138,7 +133,7 @@ def as_json(
     drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]
 ) -> dict[str, object]:
     """Return the figures as plain objects; null for what is not a number."""
-    figures: dict[str, object] = known({
+    return dict(known({
         "max_draft": [asdict(of_soil) for of_soil in drafts],
         "calls": asdict(calls),
         "immobilisation": {
@@ -149,5 +144,4 @@ def as_json(
             for w in warnings
         },
         "false_warnings": {name: found._asdict() for name, found in _pooled(warnings).items()},
-    })  # fmt: skip
-    return figures
+    }))  # fmt: skip

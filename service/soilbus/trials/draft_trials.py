@@ -85,9 +85,8 @@ def trial(config: Config, name: str, seed: int) -> DraftTrial:
     window = first_window(config, recording, torque_limits(config, rig))
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     model = WheelModel(shear_law=config.model.shear_law)
-    truth = true_largest_draft(
-        soil, rig, limit, config.traversability.max_slip, model, np.inf, drivetrain_of(config)
-    )  # fmt: skip
+    max_slip = config.traversability.max_slip
+    truth = true_largest_draft(soil, rig, limit, max_slip, model, drivetrain=drivetrain_of(config))
     predicted = WindowEstimator(with_prior(config, prior)).solve(window).traversability.max_draft
     if predicted is None:
         return DraftTrial(name, np.nan, np.nan, truth)

@@ -58,10 +58,6 @@ def _soft_soils(config: Config) -> tuple[str, ...]:
     return tuple(soil for soil, most in held.items() if most > least) or FIRM_SOILS
 
 
-def _easy(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
-    return _scenario(soil, Swing(0.2 * most, 0.65 * most))
-
-
 def _harsh(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
     knots = np.arange(0.0, 3.0 * DRIVE_TIME, 25.0)
     weight = GRAVITY * config.vehicle.mass if config.vehicle else np.inf
@@ -112,13 +108,10 @@ def _clods(config: Config, soil: str, most: float, rng: np.random.Generator) -> 
     return _scenario(soil, _profile(t, (even + blows) * most))
 
 
-def _soft(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
-    return _scenario(soil, Swing(0.1 * most, 0.5 * most))
-
-
 _DRIVES: dict[str, Callable[[Config, str, float, np.random.Generator], Scenario]] = {
-    EASY: _easy, "harsh": _harsh, "headland": _headland, "stop_and_go": _stop_and_go, "hills": _hills,
-    "clods": _clods, "soft": _soft,
+    EASY: lambda config, soil, most, rng: _scenario(soil, Swing(0.2 * most, 0.65 * most)),
+    "soft": lambda config, soil, most, rng: _scenario(soil, Swing(0.1 * most, 0.5 * most)),
+    "harsh": _harsh, "headland": _headland, "stop_and_go": _stop_and_go, "hills": _hills, "clods": _clods,
 }  # fmt: skip
 
 

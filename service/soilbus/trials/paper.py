@@ -91,9 +91,9 @@ class Solution(NamedTuple):
 class WheelEquations:
     """Eqs. 20-22 at one operating point, ready for any K_L, phi and n.
 
-    Over the contact area r b theta1 (T: that times r) the forces are K_L (normal(n) +
-    tan(phi) rubbed(n)) + c stuck.  The rear branch takes the front's stress (eqs. 5-9), so
-    one power of the sinkage at each node gives all ten integrals, and their derivatives.
+    Over the contact area r b theta1 (T: that times r) the forces are K_L (normal(n) + tan(phi) rubbed(n)) + c stuck.
+    The rear branch takes the front's stress (eqs. 5-9), so one power of the sinkage at each node gives all ten
+    integrals, and their derivatives.
     """
 
     __slots__ = ("_of_c", "_rows", "_unit", "_z")
@@ -142,22 +142,8 @@ class WheelEquations:
         forces = Forces(W * (K_L * load + W_c), DP * (K_L * pull + DP_c), T * (K_L * torque + T_c))
         return forces, (by_K_L, by_phi, by_n)
 
-    def jacobian(self, x: Unknowns) -> Array:
-        """Return the Jacobian (3, 3) of W, DP and T by K_L, phi [rad] and n (eq. 42)."""
-        return np.array(self.forces_and_columns(x)[1]).T
-
     def newton(self, measured: Forces, start: Unknowns, most: int = MAX_ITERATIONS) -> Solution:
-        """Solve by the paper's iteration: Newton's method on all three unknowns (eq. 41), undamped.
-
-        Parameters
-        ----------
-        measured
-            Forces.
-        start
-            First K_L, phi and n.
-        most
-            Greatest number of steps.
-        """
+        """Solve by the paper's iteration (eq. 41): at most so many undamped Newton steps on all unknowns."""
         x = start
         for done in range(most):
             (W, DP, T), (u, v, w) = self.forces_and_columns(x)

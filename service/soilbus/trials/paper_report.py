@@ -182,12 +182,8 @@ def paper_table(number: int, sinkage: float) -> PaperTable:
             again = errors_in_percent(from_print(run.result), run.trial.truth)[i]
             found = None if end.soil is None else as_print(end.soil)[i]
             error = None if end.soil is None else errors_in_percent(end.soil, run.trial.truth)[i]
-            rows.append(
-                PaperRow(
-                    name, run.on, run.start[i], run.result[i], run.errors[i], again, found, error, end.iterations,
-                    run.seconds, seconds,
-                )
-            )  # fmt: skip
+            printed = name, run.on, run.start[i], run.result[i], run.errors[i]
+            rows.append(PaperRow(*printed, again, found, error, end.iterations, run.seconds, seconds))
     return PaperTable(number, tuple(rows))
 
 

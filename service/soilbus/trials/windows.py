@@ -63,10 +63,9 @@ def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np
 
 def first_window(config: Config, recording: Recording, torque_limit: NDArray[np.float64]) -> WindowTask:
     """Return the task of a recording's first window, with nothing carried over from before."""
-    window = bins_of(config, recording.channels).window(0.0, config.estimator.window)
-    return task_of(
-        completed(forward(window), rig_of(config)), config.estimator.window, config, torque_limit, fresh=True
-    )
+    end = config.estimator.window
+    window = completed(forward(bins_of(config, recording.channels).window(0.0, end)), rig_of(config))
+    return task_of(window, end, config, torque_limit, fresh=True)
 
 
 def fit_from_soil(problem: ObservationModel, prior: SoilPrior, start: Soil) -> Fit | None:

@@ -16,7 +16,7 @@ from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.simulator.sensors import channel_rng, fitted, measure
+from soilbus.simulator.sensors import channel_rng, measure, sensors
 
 SOIL = "loam"
 LAP = 160.0
@@ -64,7 +64,7 @@ def traffic(config: Config, seed: int) -> Iterator[can.Message]:
 
 def _with_gains(driven: Drive, config: Config, seed: int) -> Drive:
     columns = dict(driven.columns)
-    for quantity, wheel in fitted(config):
+    for quantity, wheel, *_ in sensors(config):
         noise = getattr(config.noise, quantity, None)
         if noise is not None:
             name = f"{quantity}.{wheel}" if wheel else quantity

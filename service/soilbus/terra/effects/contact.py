@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.effects.effect import Effect, Forces, Parameter, Surroundings, Values
+from soilbus.terra.effects.effect import Effect, Forces, OnSoil, Parameter, Surroundings, Values
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 
 
-def _stress_peak_shift(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _stress_peak_shift(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """theta_m / theta_1 = peak_c1 + c1 + (peak_c2 + c2) s (1 + bend) / (1 + bend |s|)."""
     c1, c2 = model.peak_c1 + values["c1"], model.peak_c2 + values["c2"]
     return state, replace(model, peak_c1=c1, peak_c2=c2, peak_bend=values["bend"], one_off=True)
@@ -34,9 +32,7 @@ STRESS_PEAK_SHIFT = Effect(
 )
 
 
-def _rut_recovery(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _rut_recovery(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """theta_2 = -((recovery + carried s) theta_1 + angle)."""
     ratio, by_slip = model.exit_ratio - values["recovery"], model.exit_slip - values["carried"]
     angle = model.exit_angle - values["angle"]
@@ -58,9 +54,7 @@ RUT_RECOVERY = Effect(
 )
 
 
-def _exponential_shear(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _exponential_shear(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """A share of the shear strength mobilised by 1 - exp(-j/K) instead of j/(j + K)."""
     return state, replace(model, exponential_share=model.exponential_share + values["share"], one_off=True)
 
@@ -102,9 +96,7 @@ BULLDOZING = Effect(
 )
 
 
-def _lugged_soil(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _lugged_soil(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """c (1 + 2 h/b) and tan phi (1 + 0.64 (h/b) arccot(h/b))."""
     ratio = values["height"] / state.width
     friction = 1.0 + 0.64 * ratio * (np.pi / 2.0 - np.arctan(ratio))
@@ -137,9 +129,7 @@ _EVENLY = 0.04
 _MOST_DEFLECTION = 0.3  # of the width; then the rim strikes through
 
 
-def _substitute_circle(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _substitute_circle(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """The greater circle through the deepest point and the point where the flattened tyre enters the soil.
 
     A hub at the height r - delta above the deepest point gives
@@ -168,11 +158,7 @@ def _flattened_forces(forces: Forces, state: WheelState, around: Surroundings, v
     mobilised = np.exp(-np.maximum(-j_K, 0.0)) - np.exp(-np.maximum(j_K, 0.0))  # backwards where the wheel skids
     sheared = (state.c + pressure * state.tan_phi) * mobilised
     arm = _rolling(nominal, delta)
-    return (
-        forces[0] + area * pressure,
-        forces[1] + area * sheared,
-        (forces[2] / circle + area * sheared) * arm,
-    )
+    return (forces[0] + area * pressure, forces[1] + area * sheared, (forces[2] / circle + area * sheared) * arm)
 
 
 def _half_flat(radius: Any, deflection: Any) -> Any:

@@ -83,7 +83,9 @@ class Parameter:
     of_vehicle: bool = False
 
 
-WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]
+OnSoil = tuple[WheelState, WheelModel]
+"""A wheel on its soil, and the model of the two."""
+WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], OnSoil]
 ForcesHook = Callable[[Forces, WheelState, Surroundings, Values], Forces]
 TorqueHook = Callable[[Any, Surroundings, Values], Any]
 DraftHook = Callable[[Any, Surroundings, Values], Any]
@@ -153,9 +155,7 @@ class Active(NamedTuple):
     values: Values
 
 
-def wheel_with(
-    active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings
-) -> tuple[WheelState, WheelModel]:
+def wheel_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> OnSoil:
     """Return state and model of wheels with these effects."""
     for effect, values in active:
         if effect.wheel is not None:

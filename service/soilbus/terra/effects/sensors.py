@@ -37,10 +37,7 @@ DRAFT_OFFSET = Effect(
     physics="The load cell at the hitch has lost its zero: it adds a force, which may wander, to every draft.",
     source=_LOAD_CELLS + _WANDERING,
     tells="a stretch with the implement lifted: the draft must then read zero",
-    parameters=(
-        Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0),
-        *_WANDERS,
-    ),
+    parameters=(Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0), *_WANDERS),
     draft=_draft_offset,
 )
 
@@ -120,10 +117,7 @@ WHEEL_LOAD_OFFSET = Effect(
     physics="The load cell of a wheel has lost its zero: it adds a force to every load, that may wander as it warms.",
     source=_LOAD_CELLS + _WANDERING,
     tells="weighing the vehicle standing, before and after: the loads must add up to its weight",
-    parameters=(
-        Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),
-        *_WANDERS,
-    ),
+    parameters=(Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0), *_WANDERS),
     each_wheel=True,
     load=_wheel_load_offset,
 )

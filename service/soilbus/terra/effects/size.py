@@ -28,11 +28,5 @@ def for_wheel(effect: Effect, load: float, radius: float) -> Effect:
 
 
 def _times(p: Parameter, scale: float) -> Parameter:
-    return replace(
-        p,
-        neutral=p.neutral * scale,
-        std=p.std * scale,
-        low=p.low * scale,
-        high=p.high * scale,
-        starts=tuple(start * scale for start in p.starts),
-    )
+    neutral, std, low, high, *starts = (value * scale for value in (p.neutral, p.std, p.low, p.high, *p.starts))
+    return replace(p, neutral=neutral, std=std, low=low, high=high, starts=tuple(starts))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from soilbus.terra.effects.along import curve_of, share_of_way, through_knots
-from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.effects.effect import Effect, OnSoil, Parameter, Surroundings, Values
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 
 __all__ = ["HARDPAN", "MULTIPASS", "RATE_STIFFENING", "SLIP_SINKAGE", "SOIL_DRIFT"]
@@ -24,9 +24,7 @@ _LEAST_EXPONENT = 0.05
 _LEAST_CONTACT = 0.1  # of the sinkage: a wheel cannot throw away all of its ground
 
 
-def _slip_sinkage(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _slip_sinkage(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """n + exponent s, K_L exp(-softening s), contact below a layer dug s, for slips s > 0.
 
     At TYPICAL_DEPTH the exponent does nothing.
@@ -56,9 +54,7 @@ SLIP_SINKAGE = Effect(
 )
 
 
-def _rate_stiffening(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _rate_stiffening(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """K_L (V / V0)^m."""
     speed = np.maximum(np.abs(around.ground_speed), _LEAST_SPEED)
     return state._replace(K_L=state.K_L * (speed / REFERENCE_SPEED) ** values["exponent"]), model
@@ -74,9 +70,7 @@ RATE_STIFFENING = Effect(
 )
 
 
-def _multipass(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _multipass(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """Rear wheels: p_0 (K_L z^n / p_0)^exp(-reloading) exp(stiffness); c and tan phi exp(density); K exp(-shear).
 
     The power does nothing at TYPICAL_PRESSURE p_0.
@@ -85,9 +79,8 @@ def _multipass(
     strength, power = np.exp(values["density"] * rear), np.exp(-values["reloading"] * rear)
     K_L = TYPICAL_PRESSURE * np.exp(power * np.log(state.K_L / TYPICAL_PRESSURE) + values["stiffness"] * rear)
     K = state.K * np.exp(-values["shear"] * rear)
-    return state._replace(
-        n=power * state.n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K
-    ), model
+    changed = state._replace(n=power * state.n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K)
+    return changed, model
 
 
 MULTIPASS = Effect(
@@ -108,9 +101,7 @@ MULTIPASS = Effect(
 )
 
 
-def _hardpan(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _hardpan(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """From a depth on, pressure grows (1 + stiffness) times as fast as the soil's own."""
     return state, replace(model, pan_depth=values["depth"], pan_stiffness=values["stiffness"], one_off=True)
 
@@ -138,9 +129,7 @@ def _drift_of(name: str, share: np.ndarray, values: Values) -> Any:
     return values[name] * (np.clip(share, 0.0, 1.0) - 0.5) + through_knots(share, bends) - bends[len(bends) // 2]
 
 
-def _soil_drift(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _soil_drift(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """K_L, and c and tan phi together, times the exponential of a line along the way that may bend."""
     share = share_of_way(around)
     strength = np.exp(_drift_of("strength", share, values))

@@ -79,9 +79,8 @@ class CompletedModel:
         if not self.effects:
             forces, by = wheel_forces_and_slopes(state, self.model)
             return forces, Slopes(by[:, 0], by[:, 1], np.zeros_like(forces))
-        at = self.forces(state, rear, load)
+        at, more = self.forces(state, rear, load), STEP * np.maximum(load, 1.0)
         angle, slip = _step(state.entry_angle), _step(state.slip)
-        more = STEP * np.maximum(load, 1.0)
         return at, Slopes(
             (self.forces(state._replace(entry_angle=state.entry_angle + angle), rear, load) - at) / angle,
             (self.forces(state._replace(slip=state.slip + slip), rear, load) - at) / slip,

@@ -9,7 +9,7 @@ import numpy as np
 
 from soilbus.terra.dual import value_of
 from soilbus.terra.effects.along import curve_of, instants, mean_height, share_of_way, stretches, through_knots
-from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.effects.effect import Effect, OnSoil, Parameter, Surroundings, Values
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel, WheelState
 
@@ -92,9 +92,7 @@ GRADE_BESIDE_PITCH = replace(
 """The same where the pitch is measured: a slope that never changes is then an offset of that sensor, and no more."""
 
 
-def _true_radius(
-    state: WheelState, model: WheelModel, around: Surroundings, values: Values
-) -> tuple[WheelState, WheelModel]:
+def _true_radius(state: WheelState, model: WheelModel, around: Surroundings, values: Values) -> OnSoil:
     """r (1 + error), and the slip that follows from it at the same V and omega."""
     rear = np.asarray(around.rear, float)
     scale = 1.0 + values["front"] * (1.0 - rear) + values["rear"] * rear
@@ -106,10 +104,7 @@ ROLLING_RADIUS = Effect(
     physics="The tyres are not of the radius written down: worn, or others fitted; so slip is not what it seems.",
     source="slip 1 - V/(r omega): Wong 2008, ch. 1",
     tells="rolling free without draft or torque on firm ground: slip must then be nearly zero; a sinkage sensor",
-    parameters=(
-        Parameter("front", "1", 0.0, 0.03, -0.15, 0.15),
-        Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15),
-    ),
+    parameters=(Parameter("front", "1", 0.0, 0.03, -0.15, 0.15), Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15)),
     wheel=_true_radius,
     of_tyre=True,
     ruled_out="a rigid wheel is not worn or inflated: its radius is what a ruler says",

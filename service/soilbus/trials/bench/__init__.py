@@ -65,9 +65,8 @@ def _figures() -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bench.log"
-        write_log(
-            frames(simulate(config, excited("loam", RECORDING_TIME), seed=1), config, load_databases(config)), log
-        )
+        recording = simulate(config, excited("loam", RECORDING_TIME), seed=1)
+        write_log(frames(recording, config, load_databases(config)), log)
         with phases("bench") as say:
             for i, measure in enumerate(MEASUREMENTS, 1):
                 if say is not None:
@@ -85,9 +84,8 @@ def as_results(figures: Mapping[str, Figure]) -> dict[str, Any]:
 
 def bench_report(results: Mapping[str, Any]) -> str:
     """Return what run_bench() measured as a table, beside targets and peers."""
-    figures = {
-        name: Figure(**{k: v for k, v in detail.items() if k != "met"}) for name, detail in results["details"].items()
-    }
+    details = {name: {k: v for k, v in of.items() if k != "met"} for name, of in results["details"].items()}
+    figures = {name: Figure(**detail) for name, detail in details.items()}
     rows = [(name, f"{f.value:.{f.digits}f}", f.aim, f.peer, f.what) for name, f in figures.items()]
     extra = [line for f in figures.values() for line in ("", *f.more) if f.more]
     return table(("figure", "value", "target", "beside", "what"), rows) + "".join(f"{line}\n" for line in extra)

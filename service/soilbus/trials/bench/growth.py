@@ -35,8 +35,7 @@ def exponents() -> dict[str, Figure]:
     windows = [window for wheels in WHEELS for window in problems(wheels)]
     iterations = []
     for problem, prior in windows:
-        fit = _fit(problem, prior)
-        if fit is None:
+        if (fit := _fit(problem, prior)) is None:
             raise AssertionError(f"no fit of {problem.n_wheels} wheels and {problem.n} instants")
         iterations.append(fit.iterations)
     times = in_turn([partial(_fit, *window) for window in windows], ROUNDS) / np.array(iterations)

@@ -19,6 +19,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.can.decode import ColumnDecoder
 from soilbus.can.mapping import channels_of
 from soilbus.config.model import Config
+from soilbus.grouping import grouped
 from soilbus.offline.replay import estimator_beside, read_frames, read_log, replay
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
@@ -36,15 +37,13 @@ def decode_speedup(log: Path) -> Figure:
     """Compare decoding of all mapped signals, 500 frames at a time, with cantools frame by frame."""
     config = reference_configuration()
     database = load_databases(config)
-    wanted: dict[str, list[str]] = {}
-    for channel in channels_of(config, database):
-        wanted.setdefault(channel.message, []).append(channel.signal)
+    wanted = grouped(channels_of(config, database), lambda channel: channel.message)
     payloads: dict[str, list[bytes]] = {name: [] for name in wanted}
     names = {m.frame_id: m.name for m in database.messages}
     for message in read_log(log):
         if (name := names.get(message.arbitration_id)) in payloads:
             payloads[name].append(bytes(message.data))
-    decoders = {n: ColumnDecoder(database.get_message_by_name(n), s) for n, s in wanted.items()}
+    decoders = {n: ColumnDecoder(database.get_message_by_name(n), [c.signal for c in of]) for n, of in wanted.items()}
     cut = range(0, max(map(len, payloads.values())), WINDOW_FRAMES)
     windows = [(n, w) for n, f in payloads.items() for i in cut if (w := f[i : i + WINDOW_FRAMES])]
 
@@ -102,9 +101,7 @@ def window_times(log: Path) -> dict[str, Figure]:
     intake, estimate, decision = 1e3 * np.min([list(seconds_of_windows(log, config)) for _ in range(ROUNDS)], axis=0).T
     whole = intake + estimate + decision
     count = f"{len(whole)} windows of 10 s, 1 s hop, four wheels"
-    parts = ", ".join(
-        f"{name} {np.median(part):.1f}" for name, part in (("intake", intake), ("decision", decision))
-    )  # fmt: skip
+    parts = f"intake {np.median(intake):.1f}, decision {np.median(decision):.1f}"
     return {
         "window_ms": Figure(
             float(np.median(estimate)), MAX_WINDOW_MS,
