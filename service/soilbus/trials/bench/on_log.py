@@ -89,7 +89,7 @@ def replay_factors(log: Path, seconds: float) -> dict[str, Figure]:
             seconds / wall, 150.0, f"reading alone {wall_time(only_read, 3):.2f} s, whole replay {wall:.2f} s", what
         ),
         "replay_one_core_factor": Figure(
-            seconds / one_core, 300.0,
+            seconds / one_core, 100.0,
             f"processor time: reading alone {reading:.2f} s, whole replay {one_core:.2f} s", f"{what}, one process",
         ),
     }  # fmt: skip
