@@ -90,9 +90,10 @@ def left_by(
     works = age >= options.warning_time and demand > options.least_share * limit
     outgrows = math.inf
     if works and rise > 0.0 and checks:
+        width = min(std, options.form_error * most)
         wrong = math.sqrt(error / checks) * options.warning_time / options.settling_time
-        beyond = demand + options.warning_time * rise + std - limit
-        if _above(beyond, math.hypot(wrong, std)) > options.outgrows:
+        beyond = demand + options.warning_time * rise + width - limit
+        if _above(beyond, math.hypot(wrong, width)) > options.outgrows:
             outgrows = max(limit - demand, 0.0) / rise
     terms = np.stack([np.ones_like(x), x, reserve, _rate(reserve, x)])[:, known]
     lasts = max(round(options.scatter_lag * (len(x) - 1) / -x[0]), 1)

@@ -56,10 +56,10 @@ class WatchOptions:
     outgrows: float = 0.83
     """Probability that a demand outgrows the ground from which it counts: between the ploughing of `b-plough-4wd`
     (0.80) and the grades of `decisions --boggings`."""
-    takes_all: float = 0.6
+    takes_all: float = 0.65
     """Probability that a demand takes nearly all from which it counts.  At 0.5 a loader on two wheels, whose largest
     pull is known to 29 to 39 %, is warned at 0.6 of it; at 0.7 a swinging draft of `decisions --boggings` is warned of
-    5 s later."""
+    4 s later."""
     least_share: float = 0.7
     """Share that a demand must have reached before its rise counts: lowering an implement is no trouble.  Without it
     two furrows of `e-plough-loam` warned; at 0.8 nine false warnings less come in 4.65 h of other machines, but a grade
