@@ -20,16 +20,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config, ConfigError, Vehicle
 from soilbus.config.model import Effect as EffectSetting
-from soilbus.estimation.instrumentation import (
-    Coupling,
-    Group,
-    Instrumentation,
-    Row,
-    contrast,
-    rows_of,
-    unit,
-    unknown_draft,
-)
+from soilbus.estimation.instrumentation import Coupling, Group, Instrumentation, Row, contrast, rows_of, unit
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.estimation.posterior import SoilPrior
@@ -260,14 +251,14 @@ def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: S
 
 def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> list[Row]:
     """Weight, transfer to the front axle, axles between beside the others' line, and left less right; side: sd."""
-    # a draft that nothing measures shifts load in all of a window: it is part of the centre of gravity's sd
+    # a draft that nothing measures, anywhere from 0 to the largest, shifts load in all of a window
     n, chassis = len(rig.wheels), rig.chassis
     assert chassis is not None
     mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
     cg_std = UNKNOWN_SHARE * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
     share = chassis.cg_ahead_of_rear_axle / chassis.wheelbase
     transfer = rig.ahead - share
-    shifted = 0.0 if knows_draft else unknown_draft(rig.options.measurements.largest_draft)[1] * chassis.hitch_height
+    shifted = 0.0 if knows_draft else rig.options.measurements.largest_draft / math.sqrt(12.0) * chassis.hitch_height
     balance_std = math.hypot(cg_std, shifted) / chassis.cg_ahead_of_rear_axle
     rows = [
         Row((1.0,) * n, "weight", 0, "weight", mass_std),
@@ -363,9 +354,7 @@ def possible_effects(config: Config) -> list[Effect]:
     """Return the effects of the catalogue that the machine can have, with its tyres and sensors."""
     from soilbus.terra.effects.catalogue import CATALOGUE
 
-    return [
-        effect for effect in CATALOGUE.values() if (_has_tyres(config) or not effect.of_tyre) and _read(config, effect)
-    ]
+    return [e for e in CATALOGUE.values() if (_has_tyres(config) or not e.of_tyre) and _read(config, e)]
 
 
 def _read(config: Config, effect: Effect) -> bool:

@@ -21,7 +21,6 @@ observations l for the observation model, which propagates their noise through M
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -376,11 +375,6 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))
 
 
-def unknown_draft(most: Any) -> tuple[Any, Any]:
-    """Return mean and sd [N] of a draft that is anywhere from 0 to its bound."""
-    return most / 2.0, most / math.sqrt(12.0)
-
-
 def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> tuple[Array, Array]:
     """Draft [N] for the loads, and its variance: where none is measured, at most what the wheels' torques leave it."""
     mass = 0.0 if rig.chassis is None else rig.chassis.mass
@@ -388,8 +382,8 @@ def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, torque: Ar
     along = zero_if_unknown(window.acceleration) + GRAVITY * np.sin(zero_if_unknown(window.pitch))
     left = np.clip((torque / rig.radius).sum(axis=1) - mass * along, 0.0, most)
     is_measured = np.isfinite(left) & all(row.kind != "unknown" for row in given.torque)
-    mean, std = unknown_draft(np.where(is_measured, left, most))
-    return np.where(known, window.draft, mean), np.where(known, _known_var(window, "draft"), std**2)
+    bound = np.where(is_measured, left, most)  # the draft is anywhere from 0 to it
+    return np.where(known, window.draft, bound / 2.0), np.where(known, _known_var(window, "draft"), bound**2 / 12.0)
 
 
 def _known_var(window: Window, quantity: str) -> Array:
