@@ -99,11 +99,6 @@ class Linearisation:
     side_load: Array  # (N, S) loads left less right behind differentials after a Newton step
     by_sides: Array  # (N, S, m) derivatives of the rows by those of equal torques, which are used up for these loads
 
-    @property
-    def chi2(self) -> float:
-        """Sum of squares of the whitened residuals."""
-        return float(self.normal[0, 0])
-
 
 @dataclass(slots=True)
 class Optimum:

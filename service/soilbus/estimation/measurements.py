@@ -27,19 +27,9 @@ from soilbus.estimation.standing import SLOPES, STANDING, standing_columns, stan
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
-__all__ = [
-    "GAIN_QUANTITIES",
-    "MASS_GAIN",
-    "Measurements",
-    "differentiated_speed",
-    "gains_of",
-]
-
 Masked = tuple[Array, Array, NDArray[np.bool_]]
 """Values, their variances, and a mask of which are known; zero where not."""
 
-GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
-"""Quantities with a gain error, in the order of `gain_names`."""
 MASS_GAIN = "load.weight"
 """Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
@@ -56,9 +46,9 @@ _BY_INSTANT = (
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
     """Names and prior sd of the sensor gains, then of STANDING; rows that no sensor measures have their own."""
-    of_wheels, of_vehicle = GAIN_QUANTITIES[:3], GAIN_QUANTITIES[3:]
-    rows = [(f"{q}.{row.name or f'{row.kind}{row.at}'}", row.gain) for q in of_wheels for row in rows_in(rig, q)]
-    names, std = zip(*rows, *((q, rig.noise[q].gain) for q in of_vehicle), strict=True)
+    every = [(q, row) for q in ("torque", "load", "speed") for row in rows_in(rig, q)]
+    rows = [(f"{q}.{row.name or f'{row.kind}{row.at}'}", row.gain) for q, row in every]
+    names, std = zip(*rows, *((q, rig.noise[q].gain) for q in ("ground_speed", "draft")), strict=True)
     return [*names, *STANDING], [*std, *standing_std(rig)]
 
 
@@ -225,10 +215,8 @@ class Measurements:
             return self
         smooth = copy(self)
         noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
-        of_draft, of_inertia = (
-            off_curve(self.t, *column)[:, None]
-            for column in ((self.draft, self.draft_var), (self.inertia, self.inertia_var))
-        )
+        of_draft = off_curve(self.t, self.draft, self.draft_var)[:, None]
+        of_inertia = off_curve(self.t, self.inertia, self.inertia_var)[:, None]
         of_computed = self.by_draft * of_draft + self.by_inertia * of_inertia
         smooth._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
         return smooth

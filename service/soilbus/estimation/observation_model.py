@@ -384,10 +384,6 @@ class ObservationModel(Measurements):
             change -= np.tensordot(gain_step[self.layout.effects], at.load_by_effects, 1)
         return near_angle(angle, change / at.load_slope)
 
-    def allowed(self, gains: Array) -> Array:
-        """Gains (G,) clipped to their ranges."""
-        return np.asarray(np.clip(gains, *self.gain_bounds))
-
     def variances(self, gains: Array) -> tuple[Array, Array]:
         """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
         return self._corrected(gains)[5:]

@@ -135,21 +135,17 @@ class Objective:
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
-        """Return the iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
+        """Return the iterate after a step (F + A,), shortened at bounds, with latents by the linear model.
+
+        Entry angles that change far are solved.
+        """
         free = len(self.free)
         step = self.step_fraction(iterate, step) * step
         soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), iterate.gains.copy()
         gains[self.active] += step[free:]
         if self._has_gain_bounds:
-            gains = self.problem.allowed(gains)
-        return self.moved(iterate, model.linearisation, soil, gains)
-
-    def moved(self, iterate: Iterate, at: Linearisation, soil: Array, gains: Array) -> Iterate:
-        """Return the iterate of another soil (6,) and gains (G,), with latents by the linear model.
-
-        Entry angles that change far are solved.
-        """
-        changes, latents = (soil - iterate.soil, gains - iterate.gains), iterate.latents
+            gains = np.clip(gains, *self.problem.gain_bounds)
+        at, changes, latents = model.linearisation, (soil - iterate.soil, gains - iterate.gains), iterate.latents
         if self.as_measured:
             angle = self.problem.stepped_entry_angle(at, latents.entry_angle, *changes)
             new = latents._replace(entry_angle=angle)
@@ -198,7 +194,7 @@ class Objective:
         if self.as_measured:
             directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
         weighed, off = self.prior_precision @ jacobian, self.prior_residuals(iterate.soil, iterate.gains)
-        neg2_log_posterior = linearisation.chi2 + float(off @ self.prior_precision @ off)
+        neg2_log_posterior = float(linearisation.normal[0, 0]) + float(off @ self.prior_precision @ off)
         if not math.isfinite(neg2_log_posterior):
             return None
         prior_information = jacobian.T @ weighed
