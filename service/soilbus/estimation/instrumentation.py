@@ -105,19 +105,15 @@ class Instrumentation:
         return np.asarray(np.linalg.inv(self.latent_matrix))
 
     @cached_property
-    def loads_by_torques(self) -> NDArray[np.bool_]:
-        """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
-        computed, wheels = self.computes("torque"), matrix(self.load) != 0.0
-        sums = [on for on, row in zip(wheels, self.load, strict=True) if row.kind == "channel"]
-        return np.array([
-            row.kind == "side" and not computed[on].any() and any(np.array_equal(on, of_sum) for of_sum in sums)
-            for on, row in zip(wheels, self.load, strict=True)
-        ])  # fmt: skip
-
-    @cached_property
     def loads_at_prior(self) -> NDArray[np.bool_]:
-        """Which rows of loads (W,) neither a load cell nor torques measure."""
-        return np.array([row.kind != "channel" for row in self.load]) & ~self.loads_by_torques
+        """Which rows of loads (W,) neither a load cell nor torques measure.
+
+        Torques measure the difference of two wheels with a measured sum, and a measured torque each.
+        """
+        computed, rows = self.computes("torque"), list(zip(matrix(self.load) != 0.0, self.load, strict=True))
+        sums = [on.tolist() for on, row in rows if row.kind == "channel"]
+        by_torques = [row.kind == "side" and not computed[on].any() and on.tolist() in sums for on, row in rows]
+        return np.asarray(np.array([row.kind != "channel" for row in self.load]) & ~np.array(by_torques))
 
     @cached_property
     def sides(self) -> tuple[tuple[int, int], ...]:

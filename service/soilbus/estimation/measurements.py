@@ -224,18 +224,14 @@ class Measurements:
     def _observe(self) -> None:
         """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""
         given = self.rig.instrumentation
-        self._torque_matrix: Array | None = None
-        self._latent_matrix: Array | None = None
-        self._from_observed: Array | None = None
-        self._mass_gain: int | None = None
-        self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
-        self._sides: tuple[tuple[int, int], ...] = ()
-        if given is not None:
-            self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
-            self._from_observed = given.from_observed
-            self._prior_only[: len(given.load)] = given.loads_at_prior
-            self._sides = given.sides
-            self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
+        self._torque_matrix = None if given is None else matrix(given.torque)
+        self._latent_matrix = None if given is None else given.latent_matrix
+        self._from_observed = None if given is None else given.from_observed
+        self._sides = () if given is None else given.sides
+        loads = () if given is None else given.load
+        self._mass_gain = next((i for i, row in enumerate(loads) if row.kind == "weight"), None)
+        self._prior_only = np.zeros(2 * self.n_wheels + 1, bool)
+        self._prior_only[: len(loads)] = () if given is None else given.loads_at_prior
 
     def observed(self, latents: Array) -> Array:
         """Observations (N, 2 W + 1) that latents (N, 2 W + 1) of the wheels would give without noise and gain error."""

@@ -33,9 +33,6 @@ from soilbus.terra.wheel import (
     wheel_forces,
 )
 
-_DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
-_SOIL_NAMES = Soil._fields
-
 
 class ObservationModelWithEffects(ObservationModel):
     """An observation model whose wheel-soil model has effects; `free` are the effects' P parameters.
@@ -83,9 +80,9 @@ class ObservationModelWithEffects(ObservationModel):
             return super()._response(soil, gains, latents)
         standardised = gains[self.layout.effects]
         active = active_at(self.effects, self.free, standardised, self.n_wheels, derivatives=True)
-        varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
+        varied = Latents(**{name: Dual(value, {name: UNIT}) for name, value in latents._asdict().items()})  # type: ignore[arg-type]
         # the derivative by k_c is that by k_phi over the width
-        varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
+        varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in Soil._fields[1:]}
         wheels = self._wheels(soil._replace(**varied_soil), active, varied, varied.entry_angle)
         forces = reactions_with(active, forces_along(wheels.state, wheels.model), wheels.state, wheels.surroundings)
         excess, (_, drawbar, torque) = self._excess_load(forces, wheels, active, varied), forces
@@ -96,7 +93,7 @@ class ObservationModelWithEffects(ObservationModel):
             (excess, drawbar, torque, wheels.depth), len(self.free), (self.n, self.n_wheels)
         )
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
-        by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
+        by_load, by_speed, by_ground, by_angle = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
         by_carried_load = by_angle[1:] / slope  # derivatives by the load through the entry angle
 
@@ -272,15 +269,11 @@ class _Wheels(NamedTuple):
 
 def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
     """Values (M, N, W), their derivatives by latents (M, 4, N, W), soil (M, 6, N, W) and parameters (M, P, N, W)."""
-    kinds = (), (len(_DUAL_LATENTS),), (len(_SOIL_NAMES),), (n_effects,)
-    at, by_latents, by_soil, by_effects = (np.zeros((len(predicted), *kind, *shape)) for kind in kinds)
+    place = {name: i for i, name in enumerate((*Latents._fields, *Soil._fields, *range(n_effects)))}
+    at, by = np.zeros((len(predicted), *shape)), np.zeros((len(predicted), len(place), *shape))
     for i, one in enumerate(predicted):
         at[i] = value_of(one)
         for quantity, d in one.by.items() if isinstance(one, Dual) else ():
-            if isinstance(quantity, int):
-                by_effects[i, quantity] = d
-            elif quantity in _DUAL_LATENTS:
-                by_latents[i, _DUAL_LATENTS.index(quantity)] = d
-            else:
-                by_soil[i, _SOIL_NAMES.index(quantity)] = d
+            by[i, place[quantity]] = d
+    by_latents, by_soil, by_effects = np.split(by, [4, 10], axis=1)
     return at, by_latents, by_soil, by_effects

@@ -194,7 +194,7 @@ class Objective:
         if self.as_measured:
             directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
         weighed, off = self.prior_precision @ jacobian, self.prior_residuals(iterate.soil, iterate.gains)
-        neg2_log_posterior = float(linearisation.normal[0, 0]) + float(off @ self.prior_precision @ off)
+        neg2_log_posterior = linearisation.chi2 + float(off @ self.prior_precision @ off)
         if not math.isfinite(neg2_log_posterior):
             return None
         prior_information = jacobian.T @ weighed
