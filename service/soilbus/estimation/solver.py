@@ -177,11 +177,8 @@ class Objective:
         if not (self._has_gain_bounds or len(of_soil)):
             return self._identity[:0]
         sides = at_bounds(iterate.gains[self.active], *self._gain_bounds)
-        own = np.flatnonzero(sides)
-        bounds = np.zeros((len(of_soil) + len(own), len(self.free) + len(self.active)))
-        bounds[: len(of_soil), : len(self.free)] = of_soil
-        bounds[len(of_soil) + np.arange(len(own)), len(self.free) + own] = sides[own]
-        return bounds
+        of_gains = sides[:, None] * self._identity[len(self.free) :]
+        return np.concatenate([np.pad(of_soil, ((0, 0), (0, len(sides)))), of_gains[sides != 0.0]])
 
     def quadratic_model(self, iterate: Iterate) -> WindowModel | None:
         """Return the quadratic model at an iterate; None where the observation model is not finite there."""
