@@ -178,8 +178,7 @@ class Measurements:
         own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque[kept, None]
         own[~self.known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
-        nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
-        stamped.standing_latents = np.concatenate([stamped.standing_latents, nothing], axis=2)
+        stamped.standing_latents = np.pad(stamped.standing_latents, ((0, 0), (0, 0), (0, W)))
         first = self.n_sensors - len(STANDING)
         late = [name.removeprefix("lateness.") for name in STANDING[2:]]
         half = [self.sample_time(quantity) / 2.0 for quantity in [*late, *["torque"] * W]]
@@ -254,7 +253,7 @@ class Measurements:
         self.n, self._n_residuals, self.n_rows = len(self.t), self.known.shape[1], int(self.known.sum())
         self._missing = None if self.n_rows == self.known.size else ~self.known
         length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
-        self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
+        self._geometry = np.tile([self.rig.radius, self.rig.width, length], 2 * self.n)  # of every instant twice
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_], ground_speed_var: Array) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""

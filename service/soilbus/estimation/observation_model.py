@@ -247,19 +247,19 @@ class ObservationModel(Measurements):
     def _mean_response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """The mean of an instant's response while slip swings, by two Gauss-Hermite nodes.
 
-        They are one sd of each wheel's V / omega above and below its mean.
+        They are one sd of each wheel's V / omega above and below its mean, in one evaluation of every instant twice.
         """
         if not self.swing.any():
             return self._response(soil, gains, latents)
-        two = list[Response]()
-        for ratio in (1.0 + self.swing, 1.0 - self.swing):
-            at = self._response(soil, gains, latents._replace(speed=latents.speed / ratio))
-            two.append(at._replace(by_speed=at.by_speed / ratio))
-        return Response(*[0.5 * (one + other) for one, other in zip(*two, strict=True)])
+        n, ratio = self.n, 1.0 + np.concatenate([self.swing, -self.swing])
+        twice = Latents(*[np.concatenate([part, part]) for part in latents])
+        at = self._response(soil, gains, twice._replace(speed=twice.speed / ratio))
+        at = at._replace(by_speed=at.by_speed / ratio)
+        return Response(*[0.5 * (part[..., :n, :] + part[..., n:, :]) for part in at])
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
-        shape, rim = (self.n, self.n_wheels), self.rig.radius * latents.speed
+        shape, rim = latents.load.shape, self.rig.radius * latents.speed
         speed_ratio = latents.ground_speed[:, None] / rim  # 1 - slip
         forces, d = wheel_forces_and_derivatives(self._state(soil, latents.entry_angle, 1.0 - speed_ratio), self.model)
         forces, d = forces.reshape(3, *shape), d.reshape(3, 7, *shape)
