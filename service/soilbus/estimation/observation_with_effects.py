@@ -89,9 +89,8 @@ class ObservationModelWithEffects(ObservationModel):
         for effect, values in active:
             if effect.torque is not None:
                 torque = effect.torque(torque, wheels.surroundings, values)
-        at, by_latents, by_soil, by_effects = _gathered(
-            (excess, drawbar, torque, wheels.depth), len(self.free), latents.load.shape
-        )
+        found = excess, drawbar, torque, wheels.depth
+        at, by_latents, by_soil, by_effects = _gathered(found, len(self.free), latents.load.shape)
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
         by_load, by_speed, by_ground, by_angle = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
