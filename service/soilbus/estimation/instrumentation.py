@@ -214,13 +214,10 @@ def completed(window: Window, rig: Rig) -> Window:
     speed_of, speed_var = _speeds(window, rig, given)
     torque_var = _torque_variances(window, given, torque)
     torque_of = np.where(np.isfinite(torque_var), torque_read, np.nan)
-    observations = Observations(
-        torque_of,
-        torque_var,
-        np.column_stack([load_of, speed_of, window.ground_speed]),
-        np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
-        *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
-    )
+    latents = np.column_stack([load_of, speed_of, window.ground_speed])
+    latents_var = np.column_stack([load_var, speed_var, window.variance["ground_speed"]])
+    follows = (np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft))
+    observations = Observations(torque_of, torque_var, latents, latents_var, *follows)
     columns, variance = dict[str, Any](), dict(window.variance)
     for quantity, rows, read, of_rows in (
         ("load", given.load, load_read, load_var), ("speed", given.speed, speed_of, speed_var),
@@ -238,14 +235,11 @@ def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
     if other is rig or given is None or observations is None:
         return window
     W, variance, raw = len(rig.wheels), dict(window.variance), dict[str, Any]()
-    columns = {
-        "torque": (observations.torque, observations.torque_var),
-        "load": (observations.value[:, :W], observations.variance[:, :W]),
-        "speed": (observations.value[:, W : 2 * W], observations.variance[:, W : 2 * W]),
-    }
-    for quantity, (values, variances) in columns.items():
-        raw[quantity], variance[quantity] = (np.full(values.shape, np.nan) for _ in range(2))
-        for i, row in enumerate(getattr(given, quantity)):
+    values = np.hstack([observations.torque, observations.value])
+    variances = np.hstack([observations.torque_var, observations.variance])
+    for first, quantity in zip((0, W, 2 * W), ("torque", "load", "speed"), strict=True):
+        raw[quantity], variance[quantity] = np.full((2, len(values), W), np.nan)
+        for i, row in enumerate(getattr(given, quantity), first):
             if row.kind == "channel":
                 raw[quantity][:, row.at], variance[quantity][:, row.at] = values[:, i], variances[:, i]
     return completed(replace(window, variance=variance, observations=None, **raw), other)
@@ -275,8 +269,7 @@ def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
 
 def _of_vehicle(window: Window, rig: Rig) -> Window:
     """Draft, acceleration and yaw rate as the machine has them."""
-    changed: dict[str, Array] = {}
-    variance = dict(window.variance)
+    changed, variance = dict[str, Any](), dict(window.variance)
     if rig.towing == "never":
         changed["draft"] = np.zeros(len(window.t))
         weight = 0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY
@@ -291,8 +284,7 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
         variance["yaw_rate"] = (window.ground_speed / rig.chassis.wheelbase) ** 2 * window.variance["steering_angle"]
     if not changed:
         return window
-    columns: dict[str, Any] = changed
-    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **columns)
+    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **changed)
 
 
 def _combined(values: Array, weight: Array) -> Array:
@@ -389,8 +381,7 @@ def _known_var(window: Window, quantity: str) -> Array:
 
 def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array]:
     """Observations of the wheels' speeds and their variances, each (N, W)."""
-    n, W = len(window.t), len(given.speed)
-    speed, variance = np.zeros((n, W)), np.zeros((n, W))
+    speed, variance = np.zeros((2, len(window.t), len(given.speed)))
     options = rig.options.measurements
     rolling = window.ground_speed[:, None] / rig.radius / (1.0 - options.rolling_slip)
     for i, row in enumerate(given.speed):
