@@ -423,8 +423,13 @@ def rows_in(rig: Rig, quantity: str) -> tuple[Row, ...]:
     if rig.instrumentation is not None:
         found: tuple[Row, ...] = getattr(rig.instrumentation, quantity)
         return found
-    W, gain = len(rig.wheels), rig.noise[quantity].gain
-    return tuple(Row(unit(W, i), "channel", i, name, gain) for i, name in enumerate(rig.wheels))
+    return _own_channels(rig.wheels, rig.noise[quantity].gain)
+
+
+@lru_cache(64)
+def _own_channels(wheels: tuple[str, ...], gain: float) -> tuple[Row, ...]:
+    """A channel of each wheel, of one sd of gain."""
+    return tuple(Row(unit(len(wheels), i), "channel", i, name, gain) for i, name in enumerate(wheels))
 
 
 def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:
