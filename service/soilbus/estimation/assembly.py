@@ -159,16 +159,13 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
     n, vehicle, chassis = len(rig.wheels), config.vehicle, rig.chassis
     assert vehicle is not None
     assert chassis is not None
-    place = {name: i for i, name in enumerate(rig.wheels)}
-    of_axle = {
-        name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle))
-        for name in (*config.axles, "both")
-    }
+    axles = (*config.axles, "both")
+    of_axle = {name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle)) for name in axles}
     axle_ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
     groups = {
         quantity: [
-            Group(tuple(place[w.name] for w in same), (1.0 / len(same),) * len(same), same[0].name)
+            Group(tuple(rig.wheels.index(w.name) for w in same), (1.0 / len(same),) * len(same), same[0].name)
             for same in config.same_signal(quantity)
         ]
         for quantity in ("torque", "speed", "load")
@@ -184,14 +181,12 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
             groups["load"].append(Group(of_axle[a.name], (1.0,) * len(of_axle[a.name]), a.name))
     couplings = tuple(_couplings(config, of_axle, rig.drives, groups))
     side = math.hypot(computed.gain, rig.options.measurements.side_slope_share if config.signals.roll is None else 0.0)
-    torque, speed, load = (
-        rows_of(n, groups[quantity], rig.noise[quantity].gain, rows)
-        for quantity, rows in (
-            ("torque", _torque_rows(rig, couplings, ratio)),
-            ("speed", _speed_rows(rig, couplings, ratio, groups["speed"])),
-            ("load", _load_rows(rig, vehicle, side, config.measures_draft or vehicle.towing == "never")),
-        )
-    )
+    otherwise = {
+        "torque": _torque_rows(rig, couplings, ratio),
+        "speed": _speed_rows(rig, couplings, ratio, groups["speed"]),
+        "load": _load_rows(rig, vehicle, side, config.measures_draft or vehicle.towing == "never"),
+    }
+    torque, speed, load = (rows_of(n, groups[q], rig.noise[q].gain, rows) for q, rows in otherwise.items())
     plain = np.eye(n)
     if all(np.array_equal([row.weight for row in rows], plain) and all(row.kind == "channel" for row in rows)
            for rows, _ in (torque, speed, load)):  # fmt: skip

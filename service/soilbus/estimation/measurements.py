@@ -101,8 +101,7 @@ class Measurements:
         self.sinkage, self.sinkage_var, known = take("sinkage")
         self.has_sinkage = known & usable
         self.with_sinkage = bool(self.has_sinkage.any())
-        load, load_var, _ = take("load")
-        speed, speed_var, _ = take("speed")
+        (load, load_var, _), (speed, speed_var, _) = take("load"), take("speed")
         self.ground_speed, ground_speed_var, _ = take("ground_speed")
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
