@@ -197,4 +197,4 @@ def test_solved_entry_angles_carry_the_loads_with_effects(simulated):
     iterate = objective.start(np.asarray(SOILS["loam"]), gains=gains)
     np.multiply(iterate.latents.entry_angle, 1.1, out=iterate.latents.entry_angle)
     model = objective.quadratic_model(objective.with_entry_angles(iterate))
-    assert np.abs(model.linearisation.load_residual).max() < 1e-3 * problem.load.mean()
+    assert np.abs(model.linearisation.response.load_residual).max() < 1e-3 * problem.load.mean()

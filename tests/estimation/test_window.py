@@ -156,5 +156,5 @@ def test_a_window_of_samples_counts_each_row_as_one():
     assert window.variance["draft"] == pytest.approx(np.full(5, 40.0**2 + 30.0**2))
     assert window.samples == 9
     assert np.isnan(window.torque).all()
-    only = window_of_samples(RIG, t, samples, names=("draft",))
+    only = window_of_samples(RIG, t, {"draft": samples["draft"]})
     assert np.isnan(only.load).all()

@@ -86,10 +86,8 @@ def block_scores(
         Of `gain_left_out`.
     """
     free = np.diag(priors[0].covariance) > 0.0
-    is_own, R = (
-        np.append(np.ones(len(free) - len(own), bool), own)[free] if len(records) > 1 else np.ones(free.sum(), bool),
-        len(records),
-    )
+    R = len(records)
+    is_own = np.append(np.ones(len(free) - len(own), bool), own if R > 1 else np.ones(len(own), bool))[free]
     n, shared = int(is_own.sum()), int((~is_own).sum())
     columns = [np.where(is_own, np.cumsum(is_own) - 1 + i * n, np.cumsum(~is_own) - 1 + R * n) for i in range(R)]
     precision, slope = np.zeros((R * n + shared,) * 2), np.zeros(R * n + shared)

@@ -142,9 +142,8 @@ def diagnose(
     for step in search.steps():
         additions, present = step
         progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
-    if (
-        not present.converged and not present.held_out_chi2 < base.held_out_chi2
-    ):  # such an end has no evidence, and predicts worse
+    # such an end has no evidence, and predicts worse
+    if not present.converged and not present.held_out_chi2 < base.held_out_chi2:
         additions, present = [], base
     if additions:  # the noise without what they explain
         progress("finding the noise floor")

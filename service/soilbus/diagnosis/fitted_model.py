@@ -303,17 +303,11 @@ def fit_model(
     present = records[0].training
     options = records[0].options.compared if options is None else options
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
-    free_unheld = tuple(
-        f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels)
-    )
-    free = free_unheld
-    near = None if starts is None else [start.checked for start in starts]
+    free = free_unheld = tuple(f for e in effects for f in known.get(e.name) or parameters_of(e, present.n_wheels))
+    near = [None] * len(records) if starts is None else [start.checked for start in starts]
     fitted = _fits(records, prior, effects, free, starts, options)
     for _ in range(len(free)):
-        held = (
-            None if fitted is None else _held_at_edges(records[0].training.with_effects(effects, free), fitted[1], free)
-        )
-        if fitted is None or held is None:
+        if fitted is None or (held := _held_at_edges(present.with_effects(effects, free), fitted[1], free)) is None:
             break
         free, starts = held, [_start(fit) for fit in fitted[1]]
         fitted = _fits(records, prior, effects, free, starts, options)
@@ -321,10 +315,8 @@ def fit_model(
         return None
     priors, fits = fitted
     checks = [
-        check(
-            record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i], record.options
-        )
-        for i, (record, fit) in enumerate(zip(records, fits, strict=True))
+        check(record.held_out.with_effects(effects, free), prior, fit, latents, record.options)
+        for record, fit, latents in zip(records, fits, near, strict=True)
     ]
     parts = [
         _parts(record, record.training.with_effects(effects, free), fit, held_out)

@@ -27,17 +27,6 @@ from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
 
-__all__ = [
-    "FALSE_DISCOVERY_RATE",
-    "Onset",
-    "VehicleDiagnosis",
-    "diagnose_vehicle",
-    "named",
-    "onset_of",
-    "onset_probabilities",
-    "onsets_of",
-]
-
 FALSE_DISCOVERY_RATE = 0.05
 """Expected share of names that are false, over the fleet: the usual level of a test."""
 

@@ -28,8 +28,6 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, Solution, Termination, WindowModel, minimise
 from soilbus.terra.effects.effect import Effect
 
-__all__ = ["JointModel", "JointObjective", "Start", "fit_jointly", "own_gains", "priors_of"]
-
 _SOIL = len(PARAMETERS)
 
 
@@ -106,7 +104,7 @@ class JointObjective:
     def start(self, starts: Sequence[Start]) -> tuple[Iterate, ...]:
         """The iterate of each recording at its start, with the mean of the gains that all share."""
         gains = [
-            part.problem.allowed(np.where(part.problem.gain_std > 0.0, start.gains, 0.0))
+            np.clip(np.where(part.problem.gain_std > 0.0, start.gains, 0.0), *part.problem.gain_bounds)
             for part, start in zip(self.parts, starts, strict=True)
         ]
         if len(gains) > 1:

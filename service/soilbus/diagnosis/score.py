@@ -104,9 +104,7 @@ def _shifted(effect: Effect) -> Iterator[ShiftedEffect]:
     for parameter in effect.parameters:
         for value in parameter.starts:
             parameters = tuple(replace(p, neutral=value) if p is parameter else p for p in effect.parameters)
-            offsets = [
-                (value - parameter.neutral) / parameter.std if p is parameter else 0.0 for p in effect.parameters
-            ]
+            offsets = [(value - p.neutral) / p.std if p is parameter else 0.0 for p in effect.parameters]
             yield ShiftedEffect(effect, replace(effect, parameters=parameters), offsets)
 
 

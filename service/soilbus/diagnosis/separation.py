@@ -21,7 +21,6 @@ from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck, check
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import probabilities
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.observation_model import inverse_covariance
 from soilbus.estimation.observation_with_effects import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior, SoilPrior
@@ -46,21 +45,12 @@ def contested(rivals: Sequence[FittedModel]) -> tuple[str, ...]:
 
 def truths(rivals: Sequence[FittedModel]) -> tuple[Truth, ...]:
     """Each rival at its optimum, under the soil of the last recording."""
-    return tuple(
-        Truth(
-            name,
-            Soil(*rival.fits[-1].mode.soil.tolist()),
-            tuple(
-                active_at(
-                    rival.effects,
-                    rival.free,
-                    rival.fits[-1].mode.gains[rival.checks[-1].problem.n_sensors :],
-                    rival.checks[-1].problem.n_wheels,
-                )
-            ),
-        )
-        for name, rival in zip(contested(rivals), rivals, strict=True)
-    )
+    found = []
+    for name, rival in zip(contested(rivals), rivals, strict=True):
+        mode, problem = rival.fits[-1].mode, rival.checks[-1].problem
+        effects = problem.active(mode.gains[problem.n_sensors :])
+        found.append(Truth(name, Soil(*mode.soil.tolist()), tuple(effects)))
+    return tuple(found)
 
 
 def separations(

@@ -105,9 +105,8 @@ def _tests(
         n = int(known.sum())
         if n >= options.min_sample:
             square = float((z[known, i] ** 2).mean())
-            uncertain = gaussian.covariance @ (
-                slopes[known, i].T @ slopes[known, i]
-            )  # of I + M: M's trace, and that of M^2
+            uncertain = gaussian.covariance @ (slopes[known, i].T @ slopes[known, i])
+            # of I + M: M's trace, and that of M^2
             expected, of_squares = float(uncertain.trace()), float((uncertain @ uncertain).trace())
             sd = math.sqrt(2.0 * (n + 2.0 * expected + of_squares)) / n
             larger = max((square - 1.0 - expected / n) / sd, 0.0)  # smaller than noise is no disagreement

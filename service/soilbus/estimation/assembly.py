@@ -20,16 +20,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config, ConfigError, Vehicle
 from soilbus.config.model import Effect as EffectSetting
-from soilbus.estimation.instrumentation import (
-    Coupling,
-    Group,
-    Instrumentation,
-    Row,
-    contrast,
-    rows_of,
-    unit,
-    unknown_draft,
-)
+from soilbus.estimation.instrumentation import Coupling, Group, Instrumentation, Row, contrast, rows_of, unit
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.options import ESTIMATOR, EstimatorOptions
 from soilbus.estimation.posterior import SoilPrior
@@ -168,16 +159,13 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
     n, vehicle, chassis = len(rig.wheels), config.vehicle, rig.chassis
     assert vehicle is not None
     assert chassis is not None
-    place = {name: i for i, name in enumerate(rig.wheels)}
-    of_axle = {
-        name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle))
-        for name in (*config.axles, "both")
-    }
+    axles = (*config.axles, "both")
+    of_axle = {name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle)) for name in axles}
     axle_ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
     groups = {
         quantity: [
-            Group(tuple(place[w.name] for w in same), (1.0 / len(same),) * len(same), same[0].name)
+            Group(tuple(rig.wheels.index(w.name) for w in same), (1.0 / len(same),) * len(same), same[0].name)
             for same in config.same_signal(quantity)
         ]
         for quantity in ("torque", "speed", "load")
@@ -193,14 +181,12 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
             groups["load"].append(Group(of_axle[a.name], (1.0,) * len(of_axle[a.name]), a.name))
     couplings = tuple(_couplings(config, of_axle, rig.drives, groups))
     side = math.hypot(computed.gain, rig.options.measurements.side_slope_share if config.signals.roll is None else 0.0)
-    torque, speed, load = (
-        rows_of(n, groups[quantity], rig.noise[quantity].gain, rows)
-        for quantity, rows in (
-            ("torque", _torque_rows(rig, couplings, ratio)),
-            ("speed", _speed_rows(rig, couplings, ratio, groups["speed"])),
-            ("load", _load_rows(rig, vehicle, side, config.measures_draft or vehicle.towing == "never")),
-        )
-    )
+    otherwise = {
+        "torque": _torque_rows(rig, couplings, ratio),
+        "speed": _speed_rows(rig, couplings, ratio, groups["speed"]),
+        "load": _load_rows(rig, vehicle, side, config.measures_draft or vehicle.towing == "never"),
+    }
+    torque, speed, load = (rows_of(n, groups[q], rig.noise[q].gain, rows) for q, rows in otherwise.items())
     plain = np.eye(n)
     if all(np.array_equal([row.weight for row in rows], plain) and all(row.kind == "channel" for row in rows)
            for rows, _ in (torque, speed, load)):  # fmt: skip
@@ -260,14 +246,14 @@ def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: S
 
 def _load_rows(rig: Rig, vehicle: Vehicle, side: float, knows_draft: bool) -> list[Row]:
     """Weight, transfer to the front axle, axles between beside the others' line, and left less right; side: sd."""
-    # a draft that nothing measures shifts load in all of a window: it is part of the centre of gravity's sd
+    # a draft that nothing measures, anywhere from 0 to the largest, shifts load in all of a window
     n, chassis = len(rig.wheels), rig.chassis
     assert chassis is not None
     mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
     cg_std = UNKNOWN_SHARE * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
     share = chassis.cg_ahead_of_rear_axle / chassis.wheelbase
     transfer = rig.ahead - share
-    shifted = 0.0 if knows_draft else unknown_draft(rig.options.measurements.largest_draft)[1] * chassis.hitch_height
+    shifted = 0.0 if knows_draft else rig.options.measurements.largest_draft / math.sqrt(12.0) * chassis.hitch_height
     balance_std = math.hypot(cg_std, shifted) / chassis.cg_ahead_of_rear_axle
     rows = [
         Row((1.0,) * n, "weight", 0, "weight", mass_std),
@@ -363,9 +349,7 @@ def possible_effects(config: Config) -> list[Effect]:
     """Return the effects of the catalogue that the machine can have, with its tyres and sensors."""
     from soilbus.terra.effects.catalogue import CATALOGUE
 
-    return [
-        effect for effect in CATALOGUE.values() if (_has_tyres(config) or not effect.of_tyre) and _read(config, effect)
-    ]
+    return [e for e in CATALOGUE.values() if (_has_tyres(config) or not e.of_tyre) and _read(config, e)]
 
 
 def _read(config: Config, effect: Effect) -> bool:

@@ -72,10 +72,8 @@ def change_statistic(
     prior_information = jacobian.T @ with_prior.prior_precision @ jacobian
     begin = int(np.argmax(log_likelihood_ratio(misfit - _explained(gradient, information + prior_information), count)))
     # One common step for all instants from there on: the predicted soil itself must not pass for another.
-    unexplained = misfit[begin:].sum() - _explained(
-        gradient[begin:].sum(0), information[begin:].sum(0) + prior_information
-    )
-    ratio = log_likelihood_ratio(unexplained[None], count[begin:].sum(keepdims=True))
+    explained = _explained(gradient[begin:].sum(0), information[begin:].sum(0) + prior_information)
+    ratio = log_likelihood_ratio((misfit[begin:].sum() - explained)[None], count[begin:].sum(keepdims=True))
     return ChangeStatistic(first + begin, float(ratio[0]), threshold)
 
 

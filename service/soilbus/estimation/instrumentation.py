@@ -21,7 +21,6 @@ observations l for the observation model, which propagates their noise through M
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -106,19 +105,15 @@ class Instrumentation:
         return np.asarray(np.linalg.inv(self.latent_matrix))
 
     @cached_property
-    def loads_by_torques(self) -> NDArray[np.bool_]:
-        """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
-        computed, wheels = self.computes("torque"), matrix(self.load) != 0.0
-        sums = [on for on, row in zip(wheels, self.load, strict=True) if row.kind == "channel"]
-        return np.array([
-            row.kind == "side" and not computed[on].any() and any(np.array_equal(on, of_sum) for of_sum in sums)
-            for on, row in zip(wheels, self.load, strict=True)
-        ])  # fmt: skip
-
-    @cached_property
     def loads_at_prior(self) -> NDArray[np.bool_]:
-        """Which rows of loads (W,) neither a load cell nor torques measure."""
-        return np.array([row.kind != "channel" for row in self.load]) & ~self.loads_by_torques
+        """Which rows of loads (W,) neither a load cell nor torques measure.
+
+        Torques measure the difference of two wheels with a measured sum, and a measured torque each.
+        """
+        computed, rows = self.computes("torque"), list(zip(matrix(self.load) != 0.0, self.load, strict=True))
+        sums = [on.tolist() for on, row in rows if row.kind == "channel"]
+        by_torques = [row.kind == "side" and not computed[on].any() and on.tolist() in sums for on, row in rows]
+        return np.asarray(np.array([row.kind != "channel" for row in self.load]) & ~np.array(by_torques))
 
     @cached_property
     def sides(self) -> tuple[tuple[int, int], ...]:
@@ -219,13 +214,10 @@ def completed(window: Window, rig: Rig) -> Window:
     speed_of, speed_var = _speeds(window, rig, given)
     torque_var = _torque_variances(window, given, torque)
     torque_of = np.where(np.isfinite(torque_var), torque_read, np.nan)
-    observations = Observations(
-        torque_of,
-        torque_var,
-        np.column_stack([load_of, speed_of, window.ground_speed]),
-        np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
-        *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
-    )
+    latents = np.column_stack([load_of, speed_of, window.ground_speed])
+    latents_var = np.column_stack([load_var, speed_var, window.variance["ground_speed"]])
+    follows = (np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft))
+    observations = Observations(torque_of, torque_var, latents, latents_var, *follows)
     columns, variance = dict[str, Any](), dict(window.variance)
     for quantity, rows, read, of_rows in (
         ("load", given.load, load_read, load_var), ("speed", given.speed, speed_of, speed_var),
@@ -243,14 +235,11 @@ def recompleted(window: Window, rig: Rig, other: Rig) -> Window:
     if other is rig or given is None or observations is None:
         return window
     W, variance, raw = len(rig.wheels), dict(window.variance), dict[str, Any]()
-    columns = {
-        "torque": (observations.torque, observations.torque_var),
-        "load": (observations.value[:, :W], observations.variance[:, :W]),
-        "speed": (observations.value[:, W : 2 * W], observations.variance[:, W : 2 * W]),
-    }
-    for quantity, (values, variances) in columns.items():
-        raw[quantity], variance[quantity] = (np.full(values.shape, np.nan) for _ in range(2))
-        for i, row in enumerate(getattr(given, quantity)):
+    values = np.hstack([observations.torque, observations.value])
+    variances = np.hstack([observations.torque_var, observations.variance])
+    for first, quantity in zip((0, W, 2 * W), ("torque", "load", "speed"), strict=True):
+        raw[quantity], variance[quantity] = np.full((2, len(values), W), np.nan)
+        for i, row in enumerate(getattr(given, quantity), first):
             if row.kind == "channel":
                 raw[quantity][:, row.at], variance[quantity][:, row.at] = values[:, i], variances[:, i]
     return completed(replace(window, variance=variance, observations=None, **raw), other)
@@ -280,8 +269,7 @@ def straightened(window: Window, rig: Rig, yaw_rate: Array) -> Window:
 
 def _of_vehicle(window: Window, rig: Rig) -> Window:
     """Draft, acceleration and yaw rate as the machine has them."""
-    changed: dict[str, Array] = {}
-    variance = dict(window.variance)
+    changed, variance = dict[str, Any](), dict(window.variance)
     if rig.towing == "never":
         changed["draft"] = np.zeros(len(window.t))
         weight = 0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY
@@ -296,8 +284,7 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
         variance["yaw_rate"] = (window.ground_speed / rig.chassis.wheelbase) ** 2 * window.variance["steering_angle"]
     if not changed:
         return window
-    columns: dict[str, Any] = changed
-    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **columns)
+    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **changed)
 
 
 def _combined(values: Array, weight: Array) -> Array:
@@ -376,11 +363,6 @@ def _heave(window: Window, rig: Rig, given: Instrumentation) -> Array:
     return np.where(known, beyond - np.mean(beyond[known]), 0.0) if known.any() else np.zeros(len(window.t))
 
 
-def unknown_draft(most: Any) -> tuple[Any, Any]:
-    """Return mean and sd [N] of a draft that is anywhere from 0 to its bound."""
-    return most / 2.0, most / math.sqrt(12.0)
-
-
 def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, torque: Array) -> tuple[Array, Array]:
     """Draft [N] for the loads, and its variance: where none is measured, at most what the wheels' torques leave it."""
     mass = 0.0 if rig.chassis is None else rig.chassis.mass
@@ -388,8 +370,8 @@ def _draft_on_hitch(window: Window, rig: Rig, given: Instrumentation, torque: Ar
     along = zero_if_unknown(window.acceleration) + GRAVITY * np.sin(zero_if_unknown(window.pitch))
     left = np.clip((torque / rig.radius).sum(axis=1) - mass * along, 0.0, most)
     is_measured = np.isfinite(left) & all(row.kind != "unknown" for row in given.torque)
-    mean, std = unknown_draft(np.where(is_measured, left, most))
-    return np.where(known, window.draft, mean), np.where(known, _known_var(window, "draft"), std**2)
+    bound = np.where(is_measured, left, most)  # the draft is anywhere from 0 to it
+    return np.where(known, window.draft, bound / 2.0), np.where(known, _known_var(window, "draft"), bound**2 / 12.0)
 
 
 def _known_var(window: Window, quantity: str) -> Array:
@@ -399,8 +381,7 @@ def _known_var(window: Window, quantity: str) -> Array:
 
 def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array]:
     """Observations of the wheels' speeds and their variances, each (N, W)."""
-    n, W = len(window.t), len(given.speed)
-    speed, variance = np.zeros((n, W)), np.zeros((n, W))
+    speed, variance = np.zeros((2, len(window.t), len(given.speed)))
     options = rig.options.measurements
     rolling = window.ground_speed[:, None] / rig.radius / (1.0 - options.rolling_slip)
     for i, row in enumerate(given.speed):
@@ -442,8 +423,13 @@ def rows_in(rig: Rig, quantity: str) -> tuple[Row, ...]:
     if rig.instrumentation is not None:
         found: tuple[Row, ...] = getattr(rig.instrumentation, quantity)
         return found
-    W, gain = len(rig.wheels), rig.noise[quantity].gain
-    return tuple(Row(unit(W, i), "channel", i, name, gain) for i, name in enumerate(rig.wheels))
+    return _own_channels(rig.wheels, rig.noise[quantity].gain)
+
+
+@lru_cache(64)
+def _own_channels(wheels: tuple[str, ...], gain: float) -> tuple[Row, ...]:
+    """A channel of each wheel, of one sd of gain."""
+    return tuple(Row(unit(len(wheels), i), "channel", i, name, gain) for i, name in enumerate(wheels))
 
 
 def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:

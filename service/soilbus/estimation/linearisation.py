@@ -39,6 +39,7 @@ class Layout(NamedTuple):
     draft_gain: int
     standing: slice
     effects: slice
+    soil_columns: slice
     sensor_columns: slice
     effect_columns: slice
 
@@ -52,16 +53,8 @@ class Layout(NamedTuple):
             n_latents=2 * W + 1, loads=wheels, speeds=slice(W, 2 * W), ground_speed=2 * W,
             torque_gains=wheels, latent_gains=slice(W, 3 * W + 1),
             draft_gain=3 * W + 1, standing=slice(3 * W + 2, n_sensors), effects=slice(n_sensors, None),
-            sensor_columns=slice(FIRST_GAIN, column),
-            effect_columns=slice(column, None),
+            soil_columns=SOIL, sensor_columns=slice(FIRST_GAIN, column), effect_columns=slice(column, None),
         )  # fmt: skip
-
-
-@dataclass(slots=True)
-class Work:
-    """Counter of model evaluations, in instants."""
-
-    instants: int = 0
 
 
 class Latents(NamedTuple):
@@ -90,11 +83,7 @@ class Linearisation:
     variance: Array  # (N, 2 W + 1) variance of `corrected`
     by_gain: Array  # (N, 2 W + 1) minus the derivative of `corrected` by its own gain
     by_delay: Array  # (P, N, 2 W + 1) derivatives of `corrected` by the effect parameters; P = 0 without delays
-    load_residual: Array  # (N, W) latent load less the model's load at the latent entry angle
-    load_slope: Array  # (N, W) derivative of the model's load by the entry angle; the next three by slip, soil, effects
-    load_by_slip: Array
-    load_by_soil: Array  # (6, N, W)
-    load_by_effects: Array  # (P, N, W)
+    response: Response  # of the wheels; its derivatives of the load move the entry angles
     rolling_slip: Array  # (N, F) slips of the free wheels after a Newton step
     side_load: Array  # (N, S) loads left less right behind differentials after a Newton step
     by_sides: Array  # (N, S, m) derivatives of the rows by those of equal torques, which are used up for these loads
@@ -138,20 +127,20 @@ class Response(NamedTuple):
         """The response with the slips of free wheels (mask (W,)) eliminated; nothing depends on their speeds."""
         by_slip = self.by_speed.copy()
         for values in (self.value, self.by_load, self.by_soil, self.by_effects, self.by_speed):
-            eliminate_slip(values, by_slip, free)
+            self.eliminate_slip(values, by_slip, free)
         self.by_ground[:, :, free] = 0.0
         return self
 
+    @staticmethod
+    def eliminate_slip(values: Array, by_slip: Array, free: NDArray[np.bool_]) -> None:
+        """Take the slips of free wheels (mask (W,)) out of values (3, ..., N, W) by T = 0, to first order, in place.
 
-def eliminate_slip(values: Array, by_slip: Array, free: NDArray[np.bool_]) -> None:
-    """Take the slips of free wheels (mask (W,)) out of values (3, ..., N, W) by T = 0, to first order, in place.
-
-    y <- y - (dy/ds) / (dT/ds) T, where y is pull, torque and sinkage, or their derivatives by something.  by_slip
-    (3, N, W): their derivatives by the slip, or by the wheel's speed.
-    """
-    torque = by_slip[1][:, free]
-    ratio = by_slip[:, :, free] / np.where(torque == 0.0, np.inf, torque)
-    values[..., free] -= ratio.reshape(3, *[1] * (values.ndim - 3), *torque.shape) * values[1][..., free]
+        y <- y - (dy/ds) / (dT/ds) T, where y is pull, torque and sinkage, or their derivatives by something.  by_slip
+        (3, N, W): their derivatives by the slip, or by the wheel's speed.
+        """
+        torque = by_slip[1][:, free]
+        ratio = by_slip[:, :, free] / np.where(torque == 0.0, np.inf, torque)
+        values[..., free] -= ratio.reshape(3, *[1] * (values.ndim - 3), *torque.shape) * values[1][..., free]
 
 
 class DelayTerms(NamedTuple):

@@ -27,19 +27,9 @@ from soilbus.estimation.standing import SLOPES, STANDING, standing_columns, stan
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
-__all__ = [
-    "GAIN_QUANTITIES",
-    "MASS_GAIN",
-    "Measurements",
-    "differentiated_speed",
-    "gains_of",
-]
-
 Masked = tuple[Array, Array, NDArray[np.bool_]]
 """Values, their variances, and a mask of which are known; zero where not."""
 
-GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
-"""Quantities with a gain error, in the order of `gain_names`."""
 MASS_GAIN = "load.weight"
 """Name of the gain of the row that is the weight: the mass is that of the data sheet over 1 + g."""
 
@@ -56,9 +46,9 @@ _BY_INSTANT = (
 
 def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
     """Names and prior sd of the sensor gains, then of STANDING; rows that no sensor measures have their own."""
-    of_wheels, of_vehicle = GAIN_QUANTITIES[:3], GAIN_QUANTITIES[3:]
-    rows = [(f"{q}.{row.name or f'{row.kind}{row.at}'}", row.gain) for q in of_wheels for row in rows_in(rig, q)]
-    names, std = zip(*rows, *((q, rig.noise[q].gain) for q in of_vehicle), strict=True)
+    every = [(q, row) for q in ("torque", "load", "speed") for row in rows_in(rig, q)]
+    rows = [(f"{q}.{row.name or f'{row.kind}{row.at}'}", row.gain) for q, row in every]
+    names, std = zip(*rows, *((q, rig.noise[q].gain) for q in ("ground_speed", "draft")), strict=True)
     return [*names, *STANDING], [*std, *standing_std(rig)]
 
 
@@ -111,8 +101,7 @@ class Measurements:
         self.sinkage, self.sinkage_var, known = take("sinkage")
         self.has_sinkage = known & usable
         self.with_sinkage = bool(self.has_sinkage.any())
-        load, load_var, _ = take("load")
-        speed, speed_var, _ = take("speed")
+        (load, load_var, _), (speed, speed_var, _) = take("load"), take("speed")
         self.ground_speed, ground_speed_var, _ = take("ground_speed")
         self.rolls = ~rig.drives
         rolling = self.ground_speed[:, None] / rig.radius / (1.0 - rig.options.measurements.rolling_slip)
@@ -188,8 +177,7 @@ class Measurements:
         own[:, :W] = (np.eye(W) if self._torque_matrix is None else self._torque_matrix) * of_torque[kept, None]
         own[~self.known] = 0.0
         stamped.standing_rows = np.concatenate([stamped.standing_rows, own], axis=2)
-        nothing = np.zeros((*stamped.standing_latents.shape[:2], W))
-        stamped.standing_latents = np.concatenate([stamped.standing_latents, nothing], axis=2)
+        stamped.standing_latents = np.pad(stamped.standing_latents, ((0, 0), (0, 0), (0, W)))
         first = self.n_sensors - len(STANDING)
         late = [name.removeprefix("lateness.") for name in STANDING[2:]]
         half = [self.sample_time(quantity) / 2.0 for quantity in [*late, *["torque"] * W]]
@@ -225,10 +213,8 @@ class Measurements:
             return self
         smooth = copy(self)
         noise = [off_curve(self.t, *column) for column in zip(self._measured.T, self._measured_var.T, strict=True)]
-        of_draft, of_inertia = (
-            off_curve(self.t, *column)[:, None]
-            for column in ((self.draft, self.draft_var), (self.inertia, self.inertia_var))
-        )
+        of_draft = off_curve(self.t, self.draft, self.draft_var)[:, None]
+        of_inertia = off_curve(self.t, self.inertia, self.inertia_var)[:, None]
         of_computed = self.by_draft * of_draft + self.by_inertia * of_inertia
         smooth._off_curve = np.where(self._prior_only, of_computed, np.stack(noise, axis=1))
         return smooth
@@ -236,18 +222,14 @@ class Measurements:
     def _observe(self) -> None:
         """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""
         given = self.rig.instrumentation
-        self._torque_matrix: Array | None = None
-        self._latent_matrix: Array | None = None
-        self._from_observed: Array | None = None
-        self._mass_gain: int | None = None
-        self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
-        self._sides: tuple[tuple[int, int], ...] = ()
-        if given is not None:
-            self._torque_matrix, self._latent_matrix = matrix(given.torque), given.latent_matrix
-            self._from_observed = given.from_observed
-            self._prior_only[: len(given.load)] = given.loads_at_prior
-            self._sides = given.sides
-            self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
+        self._torque_matrix = None if given is None else matrix(given.torque)
+        self._latent_matrix = None if given is None else given.latent_matrix
+        self._from_observed = None if given is None else given.from_observed
+        self._sides = () if given is None else given.sides
+        loads = () if given is None else given.load
+        self._mass_gain = next((i for i, row in enumerate(loads) if row.kind == "weight"), None)
+        self._prior_only = np.zeros(2 * self.n_wheels + 1, bool)
+        self._prior_only[: len(loads)] = () if given is None else given.loads_at_prior
 
     def observed(self, latents: Array) -> Array:
         """Observations (N, 2 W + 1) that latents (N, 2 W + 1) of the wheels would give without noise and gain error."""
@@ -270,7 +252,7 @@ class Measurements:
         self.n, self._n_residuals, self.n_rows = len(self.t), self.known.shape[1], int(self.known.sum())
         self._missing = None if self.n_rows == self.known.size else ~self.known
         length = np.broadcast_to(self.rig.length, self.rig.radius.shape)
-        self._geometry = np.tile([self.rig.radius, self.rig.width, length], self.n)
+        self._geometry = np.tile([self.rig.radius, self.rig.width, length], 2 * self.n)  # of every instant twice
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_], ground_speed_var: Array) -> None:
         """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""

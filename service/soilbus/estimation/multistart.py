@@ -119,9 +119,8 @@ def fit_warm(start: WarmStart) -> Fit | None:
         if model is None or step is None:
             return None
         near = objective.stepped(start.iterate, model, step)
-        return fit_at(
-            objective, minimise(objective, near, objective.options.warm, model.squared_length(step)), evaluations=1
-        )
+        end = minimise(objective, near, objective.options.warm, model.squared_length(step))
+        return fit_at(objective, end, evaluations=1)
 
 
 def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:

@@ -35,19 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.linearisation import (
-    RESIDUAL,
-    SOIL,
-    DelayTerms,
-    Latents,
-    Layout,
-    Linearisation,
-    Optimum,
-    Response,
-    Work,
-    eliminate_slip,
-)
+from soilbus.estimation.linearisation import RESIDUAL, DelayTerms, Latents, Layout, Linearisation, Optimum, Response
 from soilbus.estimation.measurements import Measurements
+from soilbus.estimation.search_budget import Work
 from soilbus.estimation.window import TIME_TOLERANCE, Rig, Window
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.wheel import (
@@ -102,7 +92,8 @@ class ObservationModel(Measurements):
         draft, inertia = self.draft * of_draft, self.inertia * of_mass
 
         rows = np.zeros((*A.shape[:2], layout.effect_columns.start + len(gains) - self.n_sensors))
-        residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
+        residual, by_soil = rows[:, :, RESIDUAL], rows[:, :, layout.soil_columns]
+        by_effects = rows[:, :, layout.effect_columns]
         extra, extra_by_effects = self.extra_pull(gains, latents)
         residual[:, torques], residual[:, balance] = self.torque * of_torque, inertia + draft + extra.sum(0)
         if self.with_sinkage:
@@ -163,11 +154,7 @@ class ObservationModel(Measurements):
             variance=variance,
             by_gain=latent_by_gain,
             by_delay=by_delay,
-            load_residual=at.load_residual,
-            load_slope=at.load_slope,
-            load_by_slip=at.load_by_slip,
-            load_by_soil=at.load_by_soil,
-            load_by_effects=at.load_by_effects,
+            response=at,
             rolling_slip=rolling_slip,
             side_load=side_load,
             by_sides=by_sides,
@@ -260,19 +247,19 @@ class ObservationModel(Measurements):
     def _mean_response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """The mean of an instant's response while slip swings, by two Gauss-Hermite nodes.
 
-        They are one sd of each wheel's V / omega above and below its mean.
+        They are one sd of each wheel's V / omega above and below its mean, in one evaluation of every instant twice.
         """
         if not self.swing.any():
             return self._response(soil, gains, latents)
-        two = list[Response]()
-        for ratio in (1.0 + self.swing, 1.0 - self.swing):
-            at = self._response(soil, gains, latents._replace(speed=latents.speed / ratio))
-            two.append(at._replace(by_speed=at.by_speed / ratio))
-        return Response(*[0.5 * (one + other) for one, other in zip(*two, strict=True)])
+        n, ratio = self.n, 1.0 + np.concatenate([self.swing, -self.swing])
+        twice = Latents(*[np.concatenate([part, part]) for part in latents])
+        at = self._response(soil, gains, twice._replace(speed=twice.speed / ratio))
+        at = at._replace(by_speed=at.by_speed / ratio)
+        return Response(*[0.5 * (part[..., :n, :] + part[..., n:, :]) for part in at])
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
-        shape, rim = (self.n, self.n_wheels), self.rig.radius * latents.speed
+        shape, rim = latents.load.shape, self.rig.radius * latents.speed
         speed_ratio = latents.ground_speed[:, None] / rim  # 1 - slip
         forces, d = wheel_forces_and_derivatives(self._state(soil, latents.entry_angle, 1.0 - speed_ratio), self.model)
         forces, d = forces.reshape(3, *shape), d.reshape(3, 7, *shape)
@@ -363,7 +350,7 @@ class ObservationModel(Measurements):
             speed = speed.copy()
             speed[:, self.rolls] = ground[:, None] / (self.rig.radius[self.rolls] * (1.0 - at.rolling_slip))
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
-        more = load - latents.load - at.load_by_slip * slip_change
+        more = load - latents.load - at.response.load_by_slip * slip_change
         angle = self.stepped_entry_angle(at, latents.entry_angle, soil_step, gain_step, more)
         return Latents(load, speed, ground, angle)
 
@@ -379,14 +366,11 @@ class ObservationModel(Measurements):
 
         more_load (N, W) [N] is the change of the latent loads less the part that the change of slip carries.
         """
-        change = more_load + at.load_residual - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(angle.shape)
-        if len(at.load_by_effects):
-            change -= np.tensordot(gain_step[self.layout.effects], at.load_by_effects, 1)
-        return near_angle(angle, change / at.load_slope)
-
-    def allowed(self, gains: Array) -> Array:
-        """Gains (G,) clipped to their ranges."""
-        return np.asarray(np.clip(gains, *self.gain_bounds))
+        of, by_soil = at.response, at.response.load_by_soil.reshape(6, -1)
+        change = more_load + of.load_residual - (soil_step @ by_soil).reshape(angle.shape)
+        if len(of.load_by_effects):
+            change -= np.tensordot(gain_step[self.layout.effects], of.load_by_effects, 1)
+        return near_angle(angle, change / of.load_slope)
 
     def variances(self, gains: Array) -> tuple[Array, Array]:
         """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
@@ -447,7 +431,7 @@ class ObservationModel(Measurements):
             np.concatenate([by[1:] - by_load[1:, None] * by[0], -of_sinkage * by[:1]])
             for by in (by_form, by_slip[:, None])
         )
-        eliminate_slip(held, held_slip[:, 0], self.rolls)
+        Response.eliminate_slip(held, held_slip[:, 0], self.rolls)
         return held
 
     def _wheels_in_contact(
@@ -491,7 +475,7 @@ class ObservationModel(Measurements):
         Entry angles of these follow, to first order, from the earlier instant at which the wheel carried most nearly
         the same.
         """
-        shared, old, at = self._shared(previous.t), previous.latents, previous.at
+        shared, old, at = self._shared(previous.t), previous.latents, previous.at.response
         if not shared:
             return self.start(Soil(*previous.soil.tolist()), previous.gains)
         load, speed, ground = self.load[shared:], self.speed[shared:], self.ground_speed[shared:]

@@ -33,9 +33,6 @@ from soilbus.terra.wheel import (
     wheel_forces,
 )
 
-_DUAL_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
-_SOIL_NAMES = Soil._fields
-
 
 class ObservationModelWithEffects(ObservationModel):
     """An observation model whose wheel-soil model has effects; `free` are the effects' P parameters.
@@ -83,20 +80,19 @@ class ObservationModelWithEffects(ObservationModel):
             return super()._response(soil, gains, latents)
         standardised = gains[self.layout.effects]
         active = active_at(self.effects, self.free, standardised, self.n_wheels, derivatives=True)
-        varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _DUAL_LATENTS})  # type: ignore[arg-type]
+        varied = Latents(**{name: Dual(value, {name: UNIT}) for name, value in latents._asdict().items()})  # type: ignore[arg-type]
         # the derivative by k_c is that by k_phi over the width
-        varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL_NAMES[1:]}
+        varied_soil: dict[str, Any] = {name: Dual(getattr(soil, name), {name: UNIT}) for name in Soil._fields[1:]}
         wheels = self._wheels(soil._replace(**varied_soil), active, varied, varied.entry_angle)
         forces = reactions_with(active, forces_along(wheels.state, wheels.model), wheels.state, wheels.surroundings)
         excess, (_, drawbar, torque) = self._excess_load(forces, wheels, active, varied), forces
         for effect, values in active:
             if effect.torque is not None:
                 torque = effect.torque(torque, wheels.surroundings, values)
-        at, by_latents, by_soil, by_effects = _gathered(
-            (excess, drawbar, torque, wheels.depth), len(self.free), (self.n, self.n_wheels)
-        )
+        found = excess, drawbar, torque, wheels.depth
+        at, by_latents, by_soil, by_effects = _gathered(found, len(self.free), latents.load.shape)
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
-        by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
+        by_load, by_speed, by_ground, by_angle = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
         by_carried_load = by_angle[1:] / slope  # derivatives by the load through the entry angle
 
@@ -151,22 +147,23 @@ class ObservationModelWithEffects(ObservationModel):
                 resistance = resistance + effect.resistance(around, values)
             if effect.draft is not None:
                 error = error - effect.draft(draft, around, values)
-        by_effects = np.zeros((len(self.free), self.n))
+        by_effects, total = np.zeros((len(self.free), self.n)), resistance + error
         for i in range(len(self.free)):
-            by_effects[i] = slope_of(resistance + error, i)
+            by_effects[i] = slope_of(total, i)
         return np.stack([np.asarray(value_of(part)) for part in (resistance, error)]), by_effects
 
     def _surroundings(self, latents: Latents) -> Surroundings:
-        chassis = self.rig.chassis
+        """What effects see of latents of every instant, once or twice."""
+        chassis, instant = self.rig.chassis, np.arange(len(value_of(latents.load))) % self.n
         return Surroundings(
-            t=self.since[:, None],
-            distance=self.distance[:, None],
+            t=self.since[instant, None],
+            distance=self.distance[instant, None],
             load=latents.load,
             ground_speed=latents.ground_speed[:, None],
             wheel_speed=latents.speed,
             rear=~self.rig.front,
-            draft=self.draft[:, None],
-            acceleration=self.acceleration[:, None],
+            draft=self.draft[instant, None],
+            acceleration=self.acceleration[instant, None],
             mass=0.0 if chassis is None else chassis.mass,
             duration=self.duration,
             length=self.length,
@@ -215,33 +212,32 @@ class ObservationModelWithEffects(ObservationModel):
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """Return the latents with the entry angles that carry their loads; gains None: effects at prior values."""
-        solved = np.isfinite(latents.entry_angle).all() and bool(self.effects)
-        base = latents if solved else super().with_entry_angles(latents, soil, gains)
+        if not (self.effects and np.isfinite(latents.entry_angle).all()):
+            latents = super().with_entry_angles(latents, soil, gains)
         if not self.effects:
-            return base
+            return latents
         active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.layout.effects])
-        angle = base.entry_angle
+        angle = latents.entry_angle
 
         def excess(angle: Array) -> Array:
-            wheels = self._wheels(soil, active, base, angle)
+            wheels = self._wheels(soil, active, latents, angle)
             free_of_effects = wheel_forces(wheels.state, wheels.model)
             forces = reactions_with(active, free_of_effects, wheels.state, wheels.surroundings)
-            return np.asarray(self._excess_load(forces, wheels, active, base))
+            return np.asarray(self._excess_load(forces, wheels, active, latents))
 
         off = excess(angle)
         with np.errstate(all="ignore"):
-            slope = (2.0 * soil.n + 1.0) * base.load  # by the angle's logarithm, for small angles; then secants
+            slope = (2.0 * soil.n + 1.0) * latents.load  # by the angle's logarithm, for small angles; then secants
             for _ in range(6):
                 step = np.where(slope > 0.0, -off / slope, 0.0)
-                new_angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
+                before, off_before = angle, off
+                angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
                 if np.abs(step).max(initial=0.0) < 0.01:
-                    angle = new_angle
                     break
-                new_excess = excess(new_angle)
-                secant = (new_excess - off) / np.log(new_angle / angle)  # where not positive the last slope stays
+                off = excess(angle)
+                secant = (off - off_before) / np.log(angle / before)  # where not positive the last slope stays
                 slope = np.where((secant > 0.0) & np.isfinite(secant), secant, slope)
-                angle, off = new_angle, new_excess
-        return Latents(base.load, base.speed, base.ground_speed, angle)
+        return latents._replace(entry_angle=angle)
 
     def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
         """As `ObservationModel.sinkages`, with the radii that the effects give the wheels."""
@@ -272,15 +268,11 @@ class _Wheels(NamedTuple):
 
 def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
     """Values (M, N, W), their derivatives by latents (M, 4, N, W), soil (M, 6, N, W) and parameters (M, P, N, W)."""
-    kinds = (), (len(_DUAL_LATENTS),), (len(_SOIL_NAMES),), (n_effects,)
-    at, by_latents, by_soil, by_effects = (np.zeros((len(predicted), *kind, *shape)) for kind in kinds)
+    place = {name: i for i, name in enumerate((*Latents._fields, *Soil._fields, *range(n_effects)))}
+    at, by = np.zeros((len(predicted), *shape)), np.zeros((len(predicted), len(place), *shape))
     for i, one in enumerate(predicted):
         at[i] = value_of(one)
         for quantity, d in one.by.items() if isinstance(one, Dual) else ():
-            if isinstance(quantity, int):
-                by_effects[i, quantity] = d
-            elif quantity in _DUAL_LATENTS:
-                by_latents[i, _DUAL_LATENTS.index(quantity)] = d
-            else:
-                by_soil[i, _SOIL_NAMES.index(quantity)] = d
+            by[i, place[quantity]] = d
+    by_latents, by_soil, by_effects = np.split(by, [4, 10], axis=1)
     return at, by_latents, by_soil, by_effects

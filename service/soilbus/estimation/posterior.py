@@ -23,14 +23,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.options import ESTIMATOR
 from soilbus.terra.wheel import Soil
 
-__all__ = [
-    "NORMAL_95",
-    "PARAMETERS",
-    "Estimate",
-    "Posterior",
-    "SoilPrior",
-    "pressure_gradient",
-]
+__all__ = ["NORMAL_95", "PARAMETERS", "Estimate", "Posterior", "SoilPrior", "pressure_gradient"]
 
 PARAMETERS = Soil._fields
 """Names of the soil parameters, in the order of every vector of them."""

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from soilbus.estimation.linearisation import Work
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class Work:
+    """Counter of model evaluations, in instants."""
+
+    instants: int = 0
 
 
 class SearchBudget:

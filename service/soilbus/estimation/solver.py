@@ -135,21 +135,17 @@ class Objective:
         return Iterate(soil, gains, latents)
 
     def stepped(self, iterate: Iterate, model: WindowModel, step: Array) -> Iterate:
-        """Return the iterate after a step (F + A,), shortened at bounds, with latents as in `moved`."""
+        """Return the iterate after a step (F + A,), shortened at bounds, with latents by the linear model.
+
+        Entry angles that change far are solved.
+        """
         free = len(self.free)
         step = self.step_fraction(iterate, step) * step
         soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), iterate.gains.copy()
         gains[self.active] += step[free:]
         if self._has_gain_bounds:
-            gains = self.problem.allowed(gains)
-        return self.moved(iterate, model.linearisation, soil, gains)
-
-    def moved(self, iterate: Iterate, at: Linearisation, soil: Array, gains: Array) -> Iterate:
-        """Return the iterate of another soil (6,) and gains (G,), with latents by the linear model.
-
-        Entry angles that change far are solved.
-        """
-        changes, latents = (soil - iterate.soil, gains - iterate.gains), iterate.latents
+            gains = np.clip(gains, *self.problem.gain_bounds)
+        at, changes, latents = model.linearisation, (soil - iterate.soil, gains - iterate.gains), iterate.latents
         if self.as_measured:
             angle = self.problem.stepped_entry_angle(at, latents.entry_angle, *changes)
             new = latents._replace(entry_angle=angle)
@@ -181,11 +177,8 @@ class Objective:
         if not (self._has_gain_bounds or len(of_soil)):
             return self._identity[:0]
         sides = at_bounds(iterate.gains[self.active], *self._gain_bounds)
-        own = np.flatnonzero(sides)
-        bounds = np.zeros((len(of_soil) + len(own), len(self.free) + len(self.active)))
-        bounds[: len(of_soil), : len(self.free)] = of_soil
-        bounds[len(of_soil) + np.arange(len(own)), len(self.free) + own] = sides[own]
-        return bounds
+        of_gains = sides[:, None] * self._identity[len(self.free) :]
+        return np.concatenate([np.pad(of_soil, ((0, 0), (0, len(sides)))), of_gains[sides != 0.0]])
 
     def quadratic_model(self, iterate: Iterate) -> WindowModel | None:
         """Return the quadratic model at an iterate; None where the observation model is not finite there."""

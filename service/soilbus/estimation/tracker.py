@@ -270,8 +270,7 @@ class Tracker:
         t = warm.objective.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - options.min_to_detect * length))
         centred = replace(last.mode, soil=last.optimum.soil, gains=last.optimum.gains)
-        half_window = 0.5  # the last estimate is of its window's middle
-        predicted = centred.drifted(self._drift(centred, half_window))
+        predicted = centred.drifted(self._drift(centred, 0.5))  # from the middle of the last window
         false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
         found = change_statistic(warm.objective, predicted, warm.iterate, at.linearisation, first, false_alarms)
         if not found.is_alarm and not self.mismatch(fit):

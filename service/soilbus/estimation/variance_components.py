@@ -48,16 +48,14 @@ class VarianceComponents:
                 variance[quantity] = factor * variance[quantity]
         given, observations = rig.instrumentation, window.observations
         if given is not None and observations is not None:
+            kinds = (given.torque, "torque", ""), (given.load, "load", "computed_load"), (given.speed, "speed", "")
             torque, load, speed = (
                 [self.factor.get(measured if row.kind == "channel" else computed, 1.0) for row in rows]
-                for rows, measured, computed in (
-                    (given.torque, "torque", ""), (given.load, "load", "computed_load"), (given.speed, "speed", ""),
-                )
-            )  # fmt: skip
-            latents = np.array([*load, *speed, self.factor.get("ground_speed", 1.0)])
-            observations = observations._replace(
-                torque_var=observations.torque_var * torque, variance=observations.variance * latents
+                for rows, measured, computed in kinds
             )
+            latents = np.array([*load, *speed, self.factor.get("ground_speed", 1.0)])
+            torque_var, latents_var = observations.torque_var * torque, observations.variance * latents
+            observations = observations._replace(torque_var=torque_var, variance=latents_var)
         return replace(window, variance=variance, observations=observations)
 
     def after(self, found: Mapping[str, float], whole: bool = False) -> VarianceComponents:

@@ -10,7 +10,7 @@ is never zero.  `forward` mirrors reversing, `steady` goes on between the sample
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -358,11 +358,11 @@ def _variance_of_means(mean: Array, count: Array, noise: NoiseTable) -> Array:
         return np.asarray(of_sample / count)
 
 
-def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: Sequence[str] = ()) -> Window:
-    """Return a window whose rows are single samples of the named channels; t [s] (N,)."""
+def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array]) -> Window:
+    """Return a window whose rows are single samples of channels by name; t [s] (N,)."""
     mean = np.full((len(t), len(rig.channels)), np.nan)
     for i, name in enumerate(rig.channels):
-        if name in samples and (not names or name in names):
+        if name in samples:
             mean[:, i] = samples[name]
     one = np.isfinite(mean).astype(float)
     return made_window(NoiseTable.of(rig), np.asarray(t, float), mean, one, int(one.sum()))
