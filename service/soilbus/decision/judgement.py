@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand, OverSlip, assess
+from soilbus.decision.margin import above_zero
 from soilbus.decision.traversability import State, Status, Traversability, state_of
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.watch import Watch
@@ -75,9 +76,9 @@ def judge(
     if (likely := capability.likely_pull) is not None:  # some steady driving exists
         needed = demand.pull + settings.margin * max(demand.pull, 0.0)
         spare = Estimate(likely.value - needed, math.hypot(likely.std, demand.std))
-        pull = _above(spare.value, spare.std)
+        pull = above_zero(spare.value, spare.std)
     if forecast is not None:  # some slip gives the demand
-        depth = _above(settings.max_sinkage - forecast.likely_depth.value, forecast.likely_depth.std)
+        depth = above_zero(settings.max_sinkage - forecast.likely_depth.value, forecast.likely_depth.std)
     return replace(
         decision,
         state=state_of(min(pull, depth), status, settings),
@@ -135,7 +136,7 @@ def at_present(decision: Traversability, basis: Basis, watch: Watch, now: float,
     if decision.state is State.GO and decision.capability is not None and decision.spare is not None:
         curve = _Curve.of(decision.capability.over_slip, config.noise)
         missing = curve.missing_pull(watch.slip, watch.pull, settings.contradiction)
-        left = _above(decision.spare.value - missing, decision.spare.std)
+        left = above_zero(decision.spare.value - missing, decision.spare.std)
         if left < settings.go:
             return replace(decision, state=State.CAUTION, probability=left, contradicted="slip")
         forecast = decision.capability.forecast
@@ -186,8 +187,3 @@ class _Curve(NamedTuple):
             return None
         slip = max(float(self.slip[i] - (self.pull[i] - pull) / slope), 0.0)
         return Estimate(slip, math.hypot(float(np.interp(slip, self.slip, self.std)), self.draft_gain * pull) / slope)
-
-
-def _above(margin: float, std: float) -> float:
-    """Probability that a Gaussian with this mean and std is above zero."""
-    return 0.5 * math.erfc(-margin / (max(std, 1e-9) * math.sqrt(2.0)))

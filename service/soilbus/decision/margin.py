@@ -71,13 +71,13 @@ def left_by(
         return now
     slips, pulls, ahead, std = _known(curve)
     most = float(ahead[0])
-    lately = x > 0.5 * step - options.scatter_lag
-    if slip >= slips[-1] and x[lately][0] < -0.5 * options.scatter_lag:  # it has not just started
+    recent = x > 0.5 * step - options.scatter_lag
+    if slip >= slips[-1] and x[recent][0] < -0.5 * options.scatter_lag:  # it has not just started
         return now._replace(cause=f"wheels slip by {100.0 * slip:.0f} %", time_left=0.0)
     if most <= 0.0:
         return now
-    least = float(rows[lately, 3].min())
-    if _above(least / (1.0 - options.form_error) - most, std) > options.takes_all:
+    least = float(rows[recent, 3].min())
+    if above_zero(least / (1.0 - options.form_error) - most, std) > options.takes_all:
         now = now._replace(cause="draft and slope take nearly all that the ground gives")
     reserve = ahead[np.searchsorted(slips, rows[:, 1], "right")] - np.interp(rows[:, 1], slips, pulls)
     known = rows[:, 1] >= slips[0]
@@ -93,7 +93,7 @@ def left_by(
         width = min(std, options.form_error * most)
         wrong = math.sqrt(error / checks) * options.warning_time / options.settling_time
         beyond = demand + options.warning_time * rise + width - limit
-        if _above(beyond, math.hypot(wrong, width)) > options.outgrows:
+        if above_zero(beyond, math.hypot(wrong, width)) > options.outgrows:
             outgrows = max(limit - demand, 0.0) / rise
     terms = np.stack([np.ones_like(x), x, reserve, _rate(reserve, x)])[:, known]
     lasts = max(round(options.scatter_lag * (len(x) - 1) / -x[0]), 1)
@@ -165,6 +165,6 @@ def _time_to_weaken(terms: Array, weights: Array, capacity: Array, peak: float, 
     return left
 
 
-def _above(excess: float, std: float) -> float:
-    """Probability that a quantity with this mean and sd is above zero."""
-    return 0.5 * math.erfc(-excess / (math.sqrt(2.0) * max(std, 1e-9)))
+def above_zero(mean: float, std: float) -> float:
+    """Return the probability that a Gaussian with this mean and std is above zero."""
+    return 0.5 * math.erfc(-mean / (max(std, 1e-9) * math.sqrt(2.0)))

@@ -57,7 +57,7 @@ class WatchOptions:
     """Probability that a demand outgrows the ground from which it counts: between the ploughing of `b-plough-4wd`
     (0.80) and the grades of `decisions --boggings`."""
     takes_all: float = 0.65
-    """Probability that a demand takes nearly all from which it counts.  At 0.5 a loader on two wheels, whose largest
+    """Least probability that a demand takes nearly all, for a warning.  At 0.5 a loader on two wheels, whose largest
     pull is known to 29 to 39 %, is warned at 0.6 of it; at 0.7 a swinging draft of `decisions --boggings` is warned of
     4 s later."""
     least_share: float = 0.7
