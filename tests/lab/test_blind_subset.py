@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from tests.golden.outputs import the_case
@@ -41,3 +45,12 @@ def test_a_machine_without_load_cells_is_diagnosed_too():
     trial = tried(shown, truth=NOTHING)
     assert trial.named[:1] == shown.hidden
     assert trial.gap_after < trial.gap_before
+
+
+def test_cases_are_diagnosed_in_processes_of_their_own():
+    words = ["--seed", "311", "--kind", "plain", "--only", "clayey_soil_38/bare/311.20", "--processes", "2"]
+    run = subprocess.run(
+        [sys.executable, "-m", "tests.lab.blind", *words],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "plain/clayey_soil_38/bare/311.20 [0]: none" in run.stdout, run.stderr

@@ -10,13 +10,12 @@ from dataclasses import asdict
 from typing import TextIO
 
 from soilbus.allocator import keep_freed_memory
-from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import REFERENCES, TRACTOR
 from soilbus.workers import workers
 from tests.lab.blind.calibration import curve, draw, stated
 from tests.lab.blind.cases import KINDS, Case, cases
 from tests.lab.blind.table import HALVES, report, targets_are_met
-from tests.lab.blind.trial import Trial, tried
+from tests.lab.blind.trial import Trial, trial_of
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -72,21 +71,10 @@ def trials_of(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial 
     """Each case with its trial, None where it cannot be driven, in `count` processes."""
     if count < 2:
         for case in wanted:
-            yield case, _trial((case.kind, case.id, case.machine))
+            yield case, trial_of((case.kind, case.id, case.machine))
         return
     with workers(count, "spawn", keep_freed_memory) as pool:
-        yield from zip(wanted, pool.map(_trial, [(case.kind, case.id, case.machine) for case in wanted]), strict=True)
-
-
-def _trial(key: tuple[str, str, str]) -> Trial | None:
-    """The case of this kind, id and machine; forms are functions and do not travel between processes."""
-    kind, name, machine = key
-    seed = int(name.rpartition("/")[2].partition(".")[0])
-    case = next(case for case in cases(kind, seed, machine) if case.id == name)
-    try:
-        return tried(case)
-    except SimulationError:
-        return None
+        yield from zip(wanted, pool.map(trial_of, [(case.kind, case.id, case.machine) for case in wanted]), strict=True)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ from soilbus.diagnosis.records import Record
 from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.manoeuvre import record_of_recording
+from soilbus.simulator.drive import SimulationError
 from soilbus.terra.effects.effect import Effect
-from tests.lab.blind.cases import Case
+from tests.lab.blind.cases import Case, cases
 from tests.lab.blind.visible import Shown, shown
 
 
@@ -55,6 +56,20 @@ class Trial:
 def record_of_case(case: Case) -> Record:
     """What the diagnosis is given."""
     return record_of_recording(case.id, case.recording, case.config)
+
+
+def trial_of(key: tuple[str, str, str]) -> Trial | None:
+    """The trial of the case of this kind, id and machine, None where it cannot be driven.
+
+    Forms are functions and do not travel between processes; nor does what stands in a `__main__`.
+    """
+    kind, name, machine = key
+    seed = int(name.rpartition("/")[2].partition(".")[0])
+    case = next(case for case in cases(kind, seed, machine) if case.id == name)
+    try:
+        return tried(case)
+    except SimulationError:
+        return None
 
 
 def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown | None = None) -> Trial:
