@@ -53,7 +53,13 @@ LOG_SCHEMA = _schema("foxglove.Log", "name", level={"type": "integer"}, message=
 def write_mcap(
     path: Path, results: Sequence[WindowResult], config: Config, frames: Iterable[tuple[str, Frame]] = ()
 ) -> None:
-    """Write the windows in the order of their times, and between them frames, each with its channel; NotWritten."""
+    """Write the windows in the order of their times, and between them frames, each with its channel, in theirs.
+
+    Raises
+    ------
+    NotWritten
+        The file cannot be written.
+    """
     from mcap.writer import Writer
 
     records = [_without_unknowns(window_record(result, config)) for result in results]

@@ -27,7 +27,12 @@ def check_position_is_mapped(config: Config, option: str) -> None:
 
 
 def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
-    """Return a FeatureCollection, one feature a line, and the number of windows left out, which have no position."""
+    """Return a FeatureCollection, one feature a line.
+
+    Returns
+    -------
+    The text, and the number of windows without a position, which it leaves out.
+    """
     every = list(results)
     features = [json.dumps(known(_feature(r)), allow_nan=False) for r in every if r.position is not None]
     body = ",\n".join(features)

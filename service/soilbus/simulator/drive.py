@@ -68,12 +68,23 @@ class SimulationError(WorkError):
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """True values of a drive, with the effects that acted, what these may depend on (N, W), and mass and geometry.
+    """True values of a drive.
 
-    columns by name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track),
-    latitude, longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
-    entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of its
-    own motor; nan: unknown).  bogged_at [s]: when no slip lets the tractor go on and the drive ends; None without.
+    Attributes
+    ----------
+    columns
+        By name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track), latitude,
+        longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
+        entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of
+        its own motor; nan: unknown).
+    bogged_at
+        Time [s] at which no slip lets the tractor go on and the drive ends; None without.
+    effects
+        Effects that acted.
+    surroundings
+        What these may depend on (N, W).
+    chassis
+        Mass and geometry as they were.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -140,8 +151,16 @@ class _Place:
 def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
     """Drive the configured vehicle through one realisation of a scenario, which the seed picks.
 
-    Effects are those of config.model.effects and `effects`. SimulationError where there is no vehicle, it cannot even
-    start, or shall tow what it never tows; KeyError for an unknown soil; ConfigError for an effect that cannot be.
+    Effects are those of config.model.effects and `effects`.
+
+    Raises
+    ------
+    SimulationError
+        There is no vehicle, it cannot even start, or it shall tow what it never tows.
+    KeyError
+        A soil is unknown.
+    ConfigError
+        An effect cannot be.
     """
     step = math.inf if scenario.lifted else STEP
     return joined(list(steps(config, scenario, seed, effects, step)))

@@ -36,11 +36,21 @@ _OF_DRIVE = {"torque", "torque_limit", "max_torque", "motor_speed", "differentia
 class Drivetrain:
     """Drive line of M wheels: one condition a row, and the torques that are limited.
 
-    speed (M, M): weights of the rim speeds over the ground speed: of a motor (sum 1), or one side of a coupling less
-    the other; zero for a free wheel.  torque (M, M): weights of the torques: one side of a coupling less the other, or
-    a free wheel alone; zero for a motor.  bias (M,): of a coupling, 0 in all other rows; is_motor (M,).  leader (M,):
-    the wheel whose given deviation from the common slip the wheel shares, -1 for a free wheel.  limited (L, M): weights
-    of the torques that have a limit, wheels first; limit (L,): these limits [N m], inf for none.
+    Attributes
+    ----------
+    speed
+        (M, M), weights of the rim speeds over the ground speed: of a motor (sum 1), or one side of a coupling less the
+        other; zero for a free wheel.
+    torque
+        (M, M), weights of the torques: one side of a coupling less the other, or a free wheel alone; zero for a motor.
+    bias
+        (M,), of a coupling; 0 in all other rows.
+    is_motor
+        (M,).
+    leader
+        (M,), the wheel whose given deviation from the common slip the wheel shares; -1 for a free wheel.
+    limited, limit
+        (L, M) weights of the torques that have a limit, wheels first, and these limits [N m] (L,); inf for none.
     """
 
     speed: Array
@@ -63,10 +73,17 @@ def own_motors(limit: Sequence[float] | Array) -> Drivetrain:
 def drivetrain_of(config: Config) -> Drivetrain:
     """Return the drive line that the configuration describes.
 
-    An [[axle]] with a torque, a motor's speed, a limit or a differential drives its wheels together, `both` those of
-    both axles; so does one signal of torque or speed that is mapped for several wheels. Every other driven wheel has a
-    motor of its own. Couplings are those of `differential` of each axle and of `both`, open on an axle and locked
-    between the axles where it is not given. Wheels on one signal of speed turn together.
+    Parameters
+    ----------
+    config
+        An [[axle]] with a torque, a motor's speed, a limit or a differential drives its wheels together, `both` those
+        of both axles; so does one signal of torque or speed that is mapped for several wheels. Every other driven
+        wheel has a motor of its own.
+
+    Returns
+    -------
+    Couplings are those of `differential` of each axle and of `both`, open on an axle and locked between the axles
+    where it is not given. Wheels on one signal of speed turn together.
     """
     wheels = config.wheel
     n = len(wheels)

@@ -58,13 +58,29 @@ _COARSE_STRIDE = 10
 class Situation(NamedTuple):
     """Given quantities at N instants for M wheels; all arrays end in N.
 
-    Motion (N,): t [s], distance [m], ground_speed [m/s], acceleration [m/s^2]; resistance [N]: pull that slope and
-    inertia take.  Loads [N] (M, N): level_load without draft, load_per_draft their change with it, upright_load the
-    part that goes down with the cosine of a pitch that holds the vehicle back in place of a draft; zero where a draft
-    does.  Wheels (M, N): deviation of a motor's slip from the common one; radius, width, length [m] (of a track's
-    contact, 0 of a wheel); soil (6, M, N) in the order of wheel.Soil.  Limits: demand [N] (N,), the draft asked for,
-    inf for as much as possible; slip_limit (N,), which is passed below least_draft [N] (N,); torque_limit [N m] (L, N)
-    in the order of Drivetrain.limited.
+    Attributes
+    ----------
+    t, distance, ground_speed, acceleration
+        Motion (N,) [s], [m], [m/s], [m/s^2].
+    resistance
+        Pull that slope and inertia take [N] (N,).
+    level_load, load_per_draft, upright_load
+        Wheel loads without draft [N] (M, N), their change with draft (M, N), and the part of them (M, N) that goes down
+        with the cosine of a pitch that holds the vehicle back in place of a draft; zero where a draft does.
+    deviation
+        Each motor's slip beyond the common one, for each of its wheels (M, N).
+    radius, width, length
+        Of the wheels [m] (M, N); length that of a track's contact, 0 of a wheel.
+    soil
+        Parameters (6, M, N) in the order of wheel.Soil.
+    demand
+        Draft asked for [N] (N,); inf for as much as possible.
+    slip_limit
+        (N,).
+    torque_limit
+        [N m] (L, N), in the order of Drivetrain.limited.
+    least_draft
+        Draft [N] (N,) below which the slip limit is passed.
     """
 
     t: Array
@@ -101,10 +117,18 @@ class Situation(NamedTuple):
 
 
 class Mechanics(NamedTuple):
-    """The wheel-soil model, what turns the wheels, effects, and what these may depend on (see Surroundings).
+    """The wheel-soil model, effects on it, and what they may depend on (see Surroundings).
 
-    rear (M,): which wheels run in the rut of another; mass [kg] of the vehicle; duration [s] and length [m] of the
-    drive.  climbs: nothing is towed, and what is called draft is the share of the weight along the slope.
+    Attributes
+    ----------
+    rear
+        Which wheels run in the rut of another (M,).
+    mass, duration, length
+        Of the vehicle [kg], of the drive [s] and [m].
+    drivetrain
+        What turns the wheels.
+    climbs
+        Nothing is towed: what is called draft is the share of the weight along the slope.
     """
 
     model: WheelModel
@@ -135,10 +159,20 @@ _Forces = Callable[[Situation, Array, Array, Array], _Slopes]
 
 
 class Equilibrium(NamedTuple):
-    """Solution at N instants: common slip and draft [N] (N,), forces (3, M, N) by wheel.FORCES.
+    """Solution at N instants.
 
-    lead (M, N): slips of the wheels beyond the common one and the given deviation; entry_angle [rad] (M, N); found
-    (N,): whether there is an equilibrium.
+    Attributes
+    ----------
+    slip, draft
+        Common slip and draft [N] (N,).
+    lead
+        Slips of the wheels beyond the common one and the given deviation (M, N).
+    entry_angle
+        [rad] (M, N).
+    forces
+        (3, M, N) by wheel.FORCES.
+    found
+        Whether an equilibrium was found (N,).
     """
 
     slip: Array

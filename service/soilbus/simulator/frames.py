@@ -49,7 +49,13 @@ def frames(
     """Yield the recording's frames in the order of their stamps, the first instant at `start` [s].
 
     Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
-    ConfigError as `channels_of`, ValueError where a mapped message cannot be encoded.
+
+    Raises
+    ------
+    ConfigError
+        As `channels_of`.
+    ValueError
+        A mapped message cannot be encoded.
     """
     encoder = Encoder(config, recording.seed, database, start)
     yield from encoder.frames(recording.channels, recording.truth)

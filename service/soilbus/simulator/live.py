@@ -44,7 +44,13 @@ def drive_live(config: Config, scenario: Scenario, seed: int, driven: MutableSeq
     """Drive on the configured bus in real time, by the commands on it; return the system time [s] of the start.
 
     `driven` takes the true values of each step before its frames are sent; their times t [s] count from the start.
-    BusError where the bus cannot be opened, or goes away; SimulationError, KeyError and ConfigError as `drive.drive`.
+
+    Raises
+    ------
+    BusError
+        The bus cannot be opened, or goes away.
+    SimulationError, KeyError, ConfigError
+        As `drive.drive`.
     """
     commands, settings = Commands(config), config.bus.model_dump()
 

@@ -20,9 +20,21 @@ __all__ = ["write_truth"]
 
 
 def write_truth(done: Drive, path: Path, start: float) -> None:
-    """Write the true values of a drive as Parquet to a .parquet file, else as CSV; NotWritten where that cannot be.
+    """Write the true values of a drive.
 
-    `start` is the stamp of the first instant [s].
+    Parameters
+    ----------
+    done
+        The drive.
+    path
+        Of a .parquet file, or of a CSV file under any other name.
+    start
+        Stamp of the first instant [s].
+
+    Raises
+    ------
+    NotWritten
+        The table cannot be written.
     """
     whole = done.columns | {"t": start + done.columns["t"]}
     columns = {name: of for name, of in whole.items() if of.dtype.kind != "f" or np.isfinite(of).any()}

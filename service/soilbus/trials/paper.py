@@ -143,7 +143,17 @@ class WheelEquations:
         return forces, (by_K_L, by_phi, by_n)
 
     def newton(self, measured: Forces, start: Unknowns, most: int = MAX_ITERATIONS) -> Solution:
-        """Solve by the paper's iteration (eq. 41): at most so many undamped Newton steps on all unknowns."""
+        """Solve by the paper's iteration: Newton's method on all three unknowns (eq. 41), undamped.
+
+        Parameters
+        ----------
+        measured
+            Forces.
+        start
+            First K_L, phi and n.
+        most
+            Greatest number of steps.
+        """
         x = start
         for done in range(most):
             (W, DP, T), (u, v, w) = self.forces_and_columns(x)
