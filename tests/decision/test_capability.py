@@ -39,7 +39,7 @@ DUTIES = {
 
 
 def table_of(*soils: Soil, slip=GRID, start: WheelTable | None = None) -> WheelTable:
-    return wheel_table(np.array(soils), RIG, MODEL, slip, start)
+    return wheel_table(np.array(soils), RIG, MODEL, slip, start, tolerance=1e-3)
 
 
 def known_exactly(soil: Soil) -> Posterior:

@@ -41,9 +41,7 @@ LEVEL = (
     " decided: drive up and down a slope"
 )
 """What every drive on level ground leaves open."""
-RADII = (
-    "radius and slip cannot be told apart, 5 % of radius is 0.05 of slip: roll a minute without draft on firm ground"
-)
+RADII = "radius and slip are not separable, 5 % of radius is 0.05 of slip: roll a minute without draft on firm ground"
 """What every drive that pulls leaves open."""
 
 

@@ -47,8 +47,6 @@ MIN_SLIP, MAX_SKID = 0.02, 0.3
 """Least slip of driving wheels, and largest skid (minus slip) of wheels that are pushed.  No evidence recorded."""
 GRID_SLIPS = 9
 """Number of slips at which wheels are computed."""
-NEWTON_TOLERANCE = 1e-2
-"""Last Newton step as a share of the weight: its error is some 1e-4 of the largest draft, a hundredth of its std."""
 LEVEL_SINE = 1e-3
 """Sine of a slope below which the ground counts as level."""
 
@@ -172,7 +170,7 @@ def assess(
     uncertain = UncertainModel.over(model)
     points = SigmaPoints.of(posterior, uncertain.shifts, float(rig.width.mean()))
     driven, grid = ~(torque_limit <= 0.0), slip_grid(max_slip)
-    table = wheel_table(points.soils, rig, uncertain, grid, last, NEWTON_TOLERANCE, driven)
+    table = wheel_table(points.soils, rig, uncertain, grid, last, driven=driven)
     skids = np.linspace(-MAX_SKID, grid[0], GRID_SLIPS)
     axles = table.axles
     limits = Limits.of(axles, torque_limit, max_sinkage, uncertain, len(points.soils))

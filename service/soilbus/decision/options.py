@@ -63,7 +63,7 @@ class WatchOptions:
     least_share: float = 0.7
     """Share that a demand must have reached before its rise counts: lowering an implement is no trouble.  Without it
     two furrows of `e-plough-loam` warned; at 0.8 nine false warnings less come in 4.65 h of other machines, but a grade
-    is foreseen by 1.5 s in place of 3.3 s."""
+    is foreseen 1.5 s ahead, not 3.3 s."""
     draft_rise: float = 0.02
     """Rise of the draft above its mean of the last second, as a share of the weight, by which wheels slip more on any
     ground."""

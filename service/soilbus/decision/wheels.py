@@ -27,8 +27,9 @@ from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, wheel_loads
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, WheelModel, WheelState
 
-NEWTON_TOLERANCE = 1e-3
-"""Step of pull and load, as a share of the weight, below which Newton's method stops; it leaves some 1e-6."""
+NEWTON_TOLERANCE = 1e-2
+"""Step of pull and load, as a share of the weight, below which Newton's method stops.  On 120 s of loam the largest
+draft differs from that by a third of it by 1.2e-4 at most, its std by 0.8 %, in a third of the steps less."""
 RELATIVE_REGULARISATION = 1e-6
 """Ridge term of the regression on the soils' logarithms, as a share of their total sum of squares."""
 LEAST_POSITIVE = 1e-12

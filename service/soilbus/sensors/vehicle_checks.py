@@ -441,7 +441,7 @@ def _yaw(facts: Facts) -> Iterator[Finding]:
     window, rig = facts.window, facts.rig
     own = {f"{quantity}.{wheel}" for quantity in ("load", "torque") for wheel in rig.wheels}
     if pairs(rig).size and "yaw_rate" not in facts.mapped and not own <= facts.mapped:
-        raise UndecidableError("left and right wheels cannot be told apart: map signals.yaw_rate and drive curves")
+        raise UndecidableError("the log does not separate left and right wheels: map signals.yaw_rate and drive curves")
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
         return
     left, right = (rig.radius * window.speed).T[pairs(rig)]
@@ -471,7 +471,7 @@ def _radius_open(facts: Facts) -> Iterator[Finding]:
     usual = {wheel: median(facts.slip[:, facts.rig.wheels.index(wheel)]) for wheel in free}
     rims = ", ".join(f"{wheel} {1.0 / (1.0 - own):.3f}" for wheel, own in usual.items())
     over = f" (rim over ground speed of free wheels: {rims})" if rims else ""
-    what = f"radius and slip cannot be told apart, 5 % of radius is 0.05 of slip{over}"
+    what = f"radius and slip are not separable, 5 % of radius is 0.05 of slip{over}"
     raise UndecidableError(f"{what}: roll a minute without draft on firm ground")
 
 
