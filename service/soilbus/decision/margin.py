@@ -1,7 +1,7 @@
 """What the ground has left beyond what is asked of it, by the curve of pull over slip, and for how long.
 
     weakens        C = P + max P_hat(s' > s) - P_hat(s) falls to the demand Q, beyond what a wrong curve explains
-    outgrows       P(Q + h dQ/dt > C) > p, by the errors of earlier such extrapolations and the curve's width
+    outgrows       P(Q + h dQ/dt > C - w) > p, by the errors of earlier such extrapolations; w: the curve's width
     takes all      P(Q > (1 - e) max P_hat) > p, e: how wrong the curve may be, or s > s_max
 
 P: pull given, P_hat: pull over slip of the last window.  The moments are kept and seen along the newest curve: so a new
